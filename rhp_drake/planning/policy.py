@@ -1,0 +1,60 @@
+"""What a policy is: the small protocol that RHP, greedy and open loop share."""
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+
+class PolicyFailure(Exception):
+    """The policy has no action to offer; the message says why."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a policy decided in one state, and why.
+
+    Attributes:
+        action: The `rhp_drake.task.Action` to execute.
+        value: Expected return of that action, as the policy sees it; nan if it has
+            no idea.
+        roll_outs: The states the policy looked at, shape (n, h + 1, 3 + 3 m), the
+            present state first; n = 0 if it did not look ahead.
+        returns: The return of each roll-out, shape (n,).
+        memory: What the policy wants to be given at its next decision.
+    """
+
+    action: int
+    value: float
+    roll_outs: np.ndarray = field(default_factory=lambda: np.empty((0, 1, 0)))
+    returns: np.ndarray = field(default_factory=lambda: np.empty(0))
+    memory: Any = None
+
+
+class Policy(Protocol):
+    """Maps states to actions.
+
+    A policy is immutable and may be shared: whoever runs an episode keeps its
+    memory, as a Drake system keeps its state in a context.
+    """
+
+    def decide(
+        self,
+        state: np.ndarray,
+        goals: np.ndarray,
+        generator: np.random.Generator,
+        memory: Any = None,
+    ) -> Decision:
+        """Chooses an allowed action.
+
+        Args:
+            state: Shape (3 + 3 m,).
+            goals: Shape (m, 2).
+            generator: Where this decision's random draws come from.
+            memory: `Decision.memory` of the episode's decision before this one,
+                None at the first.
+
+        Raises:
+            PolicyFailure: If it has no action to offer.
+        """
+        ...

@@ -1,0 +1,242 @@
+"""The task: the Markov decision process of section III of the paper.
+
+A *state* is a vector of shape (3 + 3 m,): the planar pose (x, y, theta) of the hand
+H, then that of each of the m objects, in metres and radians in the world frame W.
+W stands at the robot's base, x forward, z up, and z = 0 is the table's top.  Object
+0 is the target, the others are obstacles.  Functions ending in an `s` of states take
+batches of shape (N, 3 + 3 m).
+
+The hand's heading theta is *unwrapped*: it counts turns, because the wrist does.
+
+This module needs NumPy alone.
+"""
+
+from dataclasses import dataclass
+import enum
+import math
+from typing import Final
+
+import numpy as np
+
+from rhp_drake.planar_geometry import rectangles_overlap
+
+BOX_SIDE: Final = 0.06  # m, section VII of the paper.
+GOAL_RADIUS: Final = 0.06  # m, section VII.
+MAX_ACTIONS: Final = 40  # Section VII.
+REWARD: Final = -1.0  # Per action, section III.
+TRANSLATION: Final = 0.05  # m per action, section VII.
+ROTATION: Final = math.pi / 6  # rad per action, section VII.
+
+# The hand is three rectangles in H: the palm and two fingers, an opening of 0.10 m,
+# wider than a box's diagonal (0.085 m).  H stands in the middle of the opening, x
+# out of it.  Columns: centre x, centre y, half length along x, half length along y.
+HAND_RECTANGLES: Final = np.array(
+    [
+        [-0.05, 0.0, 0.01, 0.07],
+        [0.0, 0.06, 0.04, 0.01],
+        [0.0, -0.06, 0.04, 0.01],
+    ]
+)
+
+# Where the origin of H may be: a UR5 with a tool of 0.15 m reaches all of it, at
+# every heading.
+WORKSPACE_LOWER: Final = np.array([0.20, -0.30])
+WORKSPACE_UPPER: Final = np.array([0.80, 0.30])
+# Wrist 3 turns within +-360 degrees, of which shoulder pan's part (up to 57 degrees
+# either way in this workspace) is not the hand's to use.
+MAX_HEADING: Final = math.radians(300)
+
+# The table's top.  An object whose centre leaves it has fallen.
+TABLE_LOWER: Final = np.array([0.10, -0.40])
+TABLE_UPPER: Final = np.array([0.90, 0.40])
+
+# Sampled tasks keep this much away from the workspace's border...
+_BOX_BORDER: Final = 0.03
+_GOAL_BORDER: Final = 0.05
+# ...and this much, in metres, between any two bodies.
+_CLEARANCE: Final = 0.005
+
+
+class Action(enum.IntEnum):
+    """The six actions: four translations along the hand's axes, two rotations."""
+
+    FORWARD = 0
+    BACKWARD = 1
+    LEFT = 2
+    RIGHT = 3
+    COUNTERCLOCKWISE = 4
+    CLOCKWISE = 5
+
+
+NUM_ACTIONS: Final = len(Action)
+
+# Displacement (x, y, theta) of the hand by each action, in its own frame H.
+ACTION_DISPLACEMENTS: Final = np.array(
+    [
+        [TRANSLATION, 0, 0],
+        [-TRANSLATION, 0, 0],
+        [0, TRANSLATION, 0],
+        [0, -TRANSLATION, 0],
+        [0, 0, ROTATION],
+        [0, 0, -ROTATION],
+    ]
+)
+
+
+@dataclass(frozen=True)
+class TaskInstance:
+    """A task instance <s_init, G> (section III).
+
+    Attributes:
+        initial_state: Shape (3 + 3 m,).
+        goals: Centres of the circular goal regions, shape (m, 2), m in W.  Each has
+            the radius `GOAL_RADIUS`; an obstacle's stands where the obstacle starts.
+    """
+
+    initial_state: np.ndarray
+    goals: np.ndarray
+
+    def __post_init__(self) -> None:
+        m = len(self.goals)
+        if self.goals.shape != (m, 2) or self.initial_state.shape != (3 + 3 * m,):
+            raise ValueError(
+                f"goals of shape {self.goals.shape} need an initial state of shape "
+                f"({3 + 3 * m},), not {self.initial_state.shape}."
+            )
+
+    @property
+    def num_objects(self) -> int:
+        """m, the target included."""
+        return len(self.goals)
+
+
+def object_positions(states: np.ndarray) -> np.ndarray:
+    """Positions (..., m, 2) of the objects in states of shape (..., 3 + 3 m)."""
+    return states[..., 3:].reshape(*states.shape[:-1], -1, 3)[..., :2]
+
+
+def goals_reached(states: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """Whether every object's centre is inside its goal region: S_goal, section III.
+
+    Args:
+        states: Shape (..., 3 + 3 m).
+        goals: Shape (..., m, 2), broadcast against the states.
+
+    Returns:
+        Booleans of shape (...).
+    """
+    offsets = object_positions(states) - goals
+    return (np.linalg.norm(offsets, axis=-1) <= GOAL_RADIUS).all(axis=-1)
+
+
+def objects_fallen(states: np.ndarray) -> np.ndarray:
+    """Whether any object's centre is off the table, shape (...)."""
+    positions = object_positions(states)
+    off = (positions < TABLE_LOWER) | (positions > TABLE_UPPER)
+    return off.any(axis=(-1, -2))
+
+
+def hand_targets(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Poses (..., 3) of the hand after the actions; nothing stops the hand.
+
+    Args:
+        states: Shape (..., 3 + 3 m), or (..., 3) for the hand's pose alone.
+        actions: Integers of shape (...).
+    """
+    d = ACTION_DISPLACEMENTS[actions]
+    x, y, theta = states[..., 0], states[..., 1], states[..., 2]
+    c, s = np.cos(theta), np.sin(theta)
+    return np.stack(
+        [
+            x + c * d[..., 0] - s * d[..., 1],
+            y + s * d[..., 0] + c * d[..., 1],
+            theta + d[..., 2],
+        ],
+        axis=-1,
+    )
+
+
+def allowed_actions(states: np.ndarray) -> np.ndarray:
+    """Which actions keep the hand in the workspace, booleans of shape (..., 6).
+
+    Roll-outs, learning and execution all take their mask from here.
+    """
+    targets = hand_targets(states[..., None, :3], np.arange(NUM_ACTIONS))
+    # A micrometre keeps a start on the border, or a rounding error, from masking.
+    inside = (targets[..., :2] >= WORKSPACE_LOWER - 1e-6) & (
+        targets[..., :2] <= WORKSPACE_UPPER + 1e-6
+    )
+    return inside.all(axis=-1) & (np.abs(targets[..., 2]) <= MAX_HEADING)
+
+
+def state_rectangles(state: np.ndarray) -> np.ndarray:
+    """The hand's three rectangles and each object's nominal square in W.
+
+    Args:
+        state: Shape (3 + 3 m,).
+
+    Returns:
+        Shape (3 + m, 5): centre x, y, angle, half lengths along the own axes.
+    """
+    x, y, theta = state[:3]
+    c, s = math.cos(theta), math.sin(theta)
+    hand = HAND_RECTANGLES
+    rows = [
+        [x + c * r[0] - s * r[1], y + s * r[0] + c * r[1], theta, r[2], r[3]]
+        for r in hand
+    ]
+    half = BOX_SIDE / 2
+    rows += [[*pose, half, half] for pose in state[3:].reshape(-1, 3)]
+    return np.array(rows)
+
+
+def overlapping_bodies(state: np.ndarray, clearance: float = 0.0) -> list[str]:
+    """Names the pairs of bodies closer than `clearance` (m), none if all is well.
+
+    Bodies are called "hand" and "object i".
+    """
+    rectangles = state_rectangles(state)
+    rectangles[:, 3:] += clearance / 2
+    names = ["hand"] * len(HAND_RECTANGLES)
+    names += [f"object {i}" for i in range(len(rectangles) - len(names))]
+    pairs = [
+        f"{names[i]} and {names[j]}"
+        for i in range(len(rectangles))
+        for j in range(max(i + 1, len(HAND_RECTANGLES)), len(rectangles))
+        if rectangles_overlap(rectangles[i], rectangles[j])
+    ]
+    return list(dict.fromkeys(pairs))
+
+
+def sample_instance(
+    generator: np.random.Generator, num_objects: int = 3
+) -> TaskInstance:
+    """Draws a random task instance, as section VII-A does.
+
+    Hand, objects and the target's goal are uniform over the workspace (less a
+    border); bodies do not overlap, and the goal is not met at the start.
+    """
+    while True:
+        hand = [
+            *generator.uniform(WORKSPACE_LOWER, WORKSPACE_UPPER),
+            generator.uniform(-math.pi, math.pi),
+        ]
+        boxes = np.column_stack(
+            [
+                generator.uniform(
+                    WORKSPACE_LOWER + _BOX_BORDER,
+                    WORKSPACE_UPPER - _BOX_BORDER,
+                    size=(num_objects, 2),
+                ),
+                generator.uniform(-math.pi, math.pi, size=num_objects),
+            ]
+        )
+        goals = boxes[:, :2].copy()
+        goals[0] = generator.uniform(
+            WORKSPACE_LOWER + _GOAL_BORDER, WORKSPACE_UPPER - _GOAL_BORDER
+        )
+        state = np.concatenate([hand, boxes.ravel()])
+        if not overlapping_bodies(state, _CLEARANCE) and not goals_reached(
+            state, goals
+        ):
+            return TaskInstance(state, goals)
