@@ -3,15 +3,13 @@
 from dataclasses import dataclass, field
 import enum
 import math
-from typing import Final
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
-
-CONTROL_PERIOD: Final = 0.008  # s; a UR5 of the CB series takes 125 commands a second.
-NUM_JOINTS: Final = 6
+from rhp_drake.station.ports import NUM_JOINTS
+from rhp_drake.station.position_servo import COMMAND_PERIOD
 
 
 class Fault(enum.IntEnum):
@@ -77,7 +75,7 @@ class CommandGuard(LeafSystem):
                 f"limits positive; it got {config}."
             )
         self._position_limits = np.array(config.position_limits)
-        self._step_limit = config.velocity_limit * CONTROL_PERIOD
+        self._step_limit = config.velocity_limit * COMMAND_PERIOD
         self._tracking_limit = config.tracking_limit
 
         self._desired_port = self.DeclareVectorInputPort(
@@ -86,13 +84,14 @@ class CommandGuard(LeafSystem):
         self._measured_port = self.DeclareVectorInputPort(
             name="position_measured", size=NUM_JOINTS
         )
-        self._position = self.DeclareDiscreteState(np.full(NUM_JOINTS, np.nan))
-        self._fault = self.DeclareDiscreteState(np.array([float(Fault.NONE)]))
-        self.DeclareStateOutputPort(name="position", state_index=self._position)
-        self.DeclareStateOutputPort(name="fault", state_index=self._fault)
+        position = self.DeclareDiscreteState(np.full(NUM_JOINTS, np.nan))
+        fault = self.DeclareDiscreteState(np.array([float(Fault.NONE)]))
+        self.DeclareStateOutputPort(name="position", state_index=position)
+        self.DeclareStateOutputPort(name="fault", state_index=fault)
+        self._position, self._fault = int(position), int(fault)
         self.DeclareInitializationDiscreteUpdateEvent(update=self._Initialize)
         self.DeclarePeriodicDiscreteUpdateEvent(
-            period_sec=CONTROL_PERIOD, offset_sec=0.0, update=self._Update
+            period_sec=COMMAND_PERIOD, offset_sec=0.0, update=self._Update
         )
 
     def _Initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -103,7 +102,7 @@ class CommandGuard(LeafSystem):
                 "there is no position to hold."
             )
         discrete_state.set_value(self._position, measured)
-        discrete_state.set_value(self._fault, [float(Fault.NONE)])
+        discrete_state.set_value(self._fault, np.array([float(Fault.NONE)]))
 
     def _Update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if context.get_discrete_state(self._fault).value()[0] != Fault.NONE:
@@ -117,7 +116,7 @@ class CommandGuard(LeafSystem):
         if fault == Fault.NONE:
             discrete_state.set_value(self._position, desired)
         else:
-            discrete_state.set_value(self._fault, [float(fault)])
+            discrete_state.set_value(self._fault, np.array([float(fault)]))
 
     def _Check(
         self, desired: np.ndarray, measured: np.ndarray, accepted: np.ndarray

@@ -8,8 +8,9 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
+from rhp_drake.station.ports import NUM_JOINTS
+from rhp_drake.station.position_servo import COMMAND_PERIOD
 from rhp_drake.station.ur5_kinematics import hand_pose, inverse_kinematics
-from rhp_drake.systems.command_guard import CONTROL_PERIOD, NUM_JOINTS
 
 LINEAR_SPEED: Final = 0.12  # m/s, peak
 ANGULAR_SPEED: Final = 0.6  # rad/s, peak
@@ -97,16 +98,17 @@ class HandServo(LeafSystem):
         )
         nan = np.full(_MOTION_SIZE, np.nan)
         # The command, and the hand's pose and velocity that belong to it.
-        self._position = self.DeclareDiscreteState(nan[:NUM_JOINTS])
-        self._pose = self.DeclareDiscreteState(nan[:3])
-        self._velocity = self.DeclareDiscreteState(3)
+        position = self.DeclareDiscreteState(nan[:NUM_JOINTS])
+        self._position = int(position)
+        self._pose = int(self.DeclareDiscreteState(nan[:3]))
+        self._velocity = int(self.DeclareDiscreteState(3))
         # The present `_Motion`, and how far in it the command is, in seconds.
-        self._motion = self.DeclareDiscreteState(nan)
-        self._clock = self.DeclareDiscreteState(1)
-        self.DeclareStateOutputPort(name="position", state_index=self._position)
+        self._motion = int(self.DeclareDiscreteState(nan))
+        self._clock = int(self.DeclareDiscreteState(1))
+        self.DeclareStateOutputPort(name="position", state_index=position)
         self.DeclareInitializationDiscreteUpdateEvent(update=self._Initialize)
         self.DeclarePeriodicDiscreteUpdateEvent(
-            period_sec=CONTROL_PERIOD, offset_sec=0.0, update=self._Update
+            period_sec=COMMAND_PERIOD, offset_sec=0.0, update=self._Update
         )
 
     def _Initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -124,7 +126,7 @@ class HandServo(LeafSystem):
         discrete_state.set_value(self._pose, pose)
         discrete_state.set_value(self._velocity, np.zeros(3))
         discrete_state.set_value(self._motion, np.full(_MOTION_SIZE, np.nan))
-        discrete_state.set_value(self._clock, [0.0])
+        discrete_state.set_value(self._clock, np.zeros(1))
 
     def _Update(self, context: Context, discrete_state: DiscreteValues) -> None:
         target = self._target_port.Eval(context)
@@ -149,12 +151,12 @@ class HandServo(LeafSystem):
         next_pose = motion.pose(next_clock)
         discrete_state.set_value(self._position, next_position)
         discrete_state.set_value(self._pose, next_pose)
-        discrete_state.set_value(self._velocity, (next_pose - pose) / CONTROL_PERIOD)
+        discrete_state.set_value(self._velocity, (next_pose - pose) / COMMAND_PERIOD)
         discrete_state.set_value(
             self._motion,
             np.concatenate([motion.start, motion.start_velocity, motion.target]),
         )
-        discrete_state.set_value(self._clock, [next_clock])
+        discrete_state.set_value(self._clock, np.array([next_clock]))
 
 
 def _next_step(
@@ -171,7 +173,7 @@ def _next_step(
         The next time within the motion and the next command, or None if there is no
         way on.
     """
-    time_step = CONTROL_PERIOD
+    time_step = COMMAND_PERIOD
     try:
         # Rather than go as far as possible, stay if the target is out of reach or nan.
         inverse_kinematics(motion.target)
@@ -179,7 +181,7 @@ def _next_step(
         for _ in range(5):
             next_clock = min(clock + time_step, motion.duration)
             next_position = inverse_kinematics(motion.pose(next_clock))
-            speed = np.abs(next_position - position).max() / CONTROL_PERIOD
+            speed = np.abs(next_position - position).max() / COMMAND_PERIOD
             if speed <= JOINT_SPEED:
                 return next_clock, next_position
             time_step *= 0.98 * JOINT_SPEED / speed

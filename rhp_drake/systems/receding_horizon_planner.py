@@ -136,11 +136,12 @@ class RecedingHorizonPlanner(LeafSystem):
         self._goals_port = self.DeclareVectorInputPort(
             name="goals", size=2 * num_objects
         )
-        self._seed = self.DeclareNumericParameter(BasicVector([0.0]))
-        self._episode = self.DeclareAbstractState(
+        self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
+        episode = self.DeclareAbstractState(
             AbstractValue.Make(_Episode(hand_target=np.full(3, np.nan)))
         )
-        prerequisites = {self.abstract_state_ticket(self._episode)}
+        self._episode = int(episode)
+        prerequisites = {self.abstract_state_ticket(episode)}
         self.DeclareVectorOutputPort(
             name="hand_target",
             size=3,
@@ -181,7 +182,7 @@ class RecedingHorizonPlanner(LeafSystem):
         context.get_mutable_numeric_parameter(self._seed).SetAtIndex(0, float(seed))
 
     def _get_episode(self, context: Context) -> _Episode:
-        return context.get_abstract_state(int(self._episode)).get_value()
+        return context.get_abstract_state(self._episode).get_value()
 
     def _CalcHandTarget(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._get_episode(context).hand_target)
@@ -196,7 +197,7 @@ class RecedingHorizonPlanner(LeafSystem):
         output.set_value(self._get_episode(context).message)
 
     def _set_episode(self, state: State, episode: _Episode) -> None:
-        state.get_mutable_abstract_state(int(self._episode)).set_value(episode)
+        state.get_mutable_abstract_state(self._episode).set_value(episode)
 
     def _Initialize(self, context: Context, state: State) -> None:
         hand = self._state_port.Eval(context)[:3].copy()

@@ -7,8 +7,9 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from rhp_drake.station.ports import NUM_JOINTS
+from rhp_drake.station.position_servo import COMMAND_PERIOD
 from rhp_drake.station.ur5_kinematics import hand_pose
-from rhp_drake.systems.command_guard import CONTROL_PERIOD, NUM_JOINTS
 
 REST_WINDOW: Final = 0.1  # s
 # What may move within the window.  Twice the noise of a motion-capture system, and
@@ -64,9 +65,10 @@ class StateEstimator(LeafSystem):
             name="object_poses", model_value=AbstractValue.Make([RigidTransform()])
         )
         # The state that the scene has stayed close to, and since when it has.
-        self._reference = self.DeclareDiscreteState(np.full(size, np.nan))
-        self._reference_time = self.DeclareDiscreteState(1)
-        self._at_rest = self.DeclareDiscreteState(1)
+        self._reference = int(self.DeclareDiscreteState(np.full(size, np.nan)))
+        self._reference_time = int(self.DeclareDiscreteState(1))
+        at_rest = self.DeclareDiscreteState(1)
+        self._at_rest = int(at_rest)
         self._state_port = self.DeclareVectorOutputPort(
             name="state",
             size=size,
@@ -76,10 +78,10 @@ class StateEstimator(LeafSystem):
                 self._poses_port.ticket(),
             },
         )
-        self.DeclareStateOutputPort(name="at_rest", state_index=self._at_rest)
+        self.DeclareStateOutputPort(name="at_rest", state_index=at_rest)
         self.DeclareInitializationDiscreteUpdateEvent(update=self._Initialize)
         self.DeclarePeriodicDiscreteUpdateEvent(
-            period_sec=CONTROL_PERIOD, offset_sec=0.0, update=self._UpdateAtRest
+            period_sec=COMMAND_PERIOD, offset_sec=0.0, update=self._UpdateAtRest
         )
 
     def _CalcState(self, context: Context, output: BasicVector) -> None:
@@ -92,8 +94,8 @@ class StateEstimator(LeafSystem):
         finite = np.isfinite(position).all()
         parts = [hand_pose(position) if finite else np.full(3, np.nan)]
         for X_WB in poses:
-            x_axis = X_WB.rotation().col(0)
-            yaw = np.arctan2(x_axis[1], x_axis[0])
+            R_WB = X_WB.rotation().matrix()
+            yaw = np.arctan2(R_WB[1, 0], R_WB[0, 0])
             parts.append(np.array([*X_WB.translation()[:2], yaw]))
         output.SetFromVector(np.concatenate(parts))
 
@@ -102,8 +104,8 @@ class StateEstimator(LeafSystem):
 
     def _SetReference(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._reference, self._state_port.Eval(context))
-        discrete_state.set_value(self._reference_time, [context.get_time()])
-        discrete_state.set_value(self._at_rest, [0.0])
+        discrete_state.set_value(self._reference_time, np.array([context.get_time()]))
+        discrete_state.set_value(self._at_rest, np.zeros(1))
 
     def _UpdateAtRest(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._state_port.Eval(context)
@@ -121,5 +123,5 @@ class StateEstimator(LeafSystem):
             return
         since = context.get_discrete_state(self._reference_time).value()[0]
         # Half a period keeps rounding of times from costing a tick.
-        rested = context.get_time() - since >= REST_WINDOW - CONTROL_PERIOD / 2
-        discrete_state.set_value(self._at_rest, [float(rested)])
+        rested = context.get_time() - since >= REST_WINDOW - COMMAND_PERIOD / 2
+        discrete_state.set_value(self._at_rest, np.array([float(rested)]))

@@ -1,0 +1,165 @@
+"""Tests of rhp_drake.systems.command_guard."""
+
+import math
+
+import numpy as np
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.systems.analysis import Simulator
+import pytest
+
+from rhp_drake.errors import InputError
+from rhp_drake.station.position_servo import COMMAND_PERIOD
+from rhp_drake.systems.command_guard import CommandGuard, CommandGuardConfig, Fault
+
+START = np.array([0.1, -1.2, 1.5, -1.9, -1.57, 0.3])
+SMALL = 0.9 * CommandGuardConfig().velocity_limit * COMMAND_PERIOD
+
+
+class Bench:
+    """A guard in a simulator, one tick at a time."""
+
+    def __init__(self, measured=START):
+        self.guard = CommandGuard(CommandGuardConfig())
+        self.simulator = Simulator(self.guard)
+        self.context = self.simulator.get_mutable_context()
+        self.ticks = 0
+        self.give(START, measured)
+        self.simulator.Initialize()
+
+    def give(self, desired, measured):
+        self.guard.GetInputPort("position").FixValue(self.context, desired)
+        self.guard.GetInputPort("position_measured").FixValue(self.context, measured)
+
+    def tick(self, desired, measured=None):
+        """The command and the fault after a tick; a perfect arm if none is given."""
+        self.give(desired, self.position if measured is None else measured)
+        self.ticks += 1
+        self.simulator.AdvanceTo((self.ticks - 0.5) * COMMAND_PERIOD)
+        return self.position, self.fault
+
+    @property
+    def position(self):
+        return self.guard.GetOutputPort("position").Eval(self.context)
+
+    @property
+    def fault(self):
+        return Fault(int(self.guard.GetOutputPort("fault").Eval(self.context)[0]))
+
+
+def test_starts_at_measured_position():
+    dut = Bench()
+    np.testing.assert_array_equal(dut.position, START)
+    assert dut.fault == Fault.NONE
+
+
+def test_is_nan_before_initialization():
+    guard = CommandGuard(CommandGuardConfig())
+    context = guard.CreateDefaultContext()
+    assert np.isnan(guard.GetOutputPort("position").Eval(context)).all()
+
+
+def test_passes_safe_commands_on():
+    dut = Bench()
+    desired = START
+    for _ in range(20):
+        desired = desired + SMALL
+        position, fault = dut.tick(desired)
+        np.testing.assert_array_equal(position, desired)
+        assert fault == Fault.NONE
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_not_finite(bad):
+    dut = Bench()
+    desired = START.copy()
+    desired[3] = bad
+    position, fault = dut.tick(desired)
+    assert fault == Fault.NOT_FINITE
+    np.testing.assert_array_equal(position, START)
+
+
+def test_measurement_not_finite():
+    assert Bench().tick(START, np.full(6, math.nan))[1] == Fault.NOT_FINITE
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_position_limit(joint, sign):
+    limit = CommandGuardConfig().position_limits[joint]
+    assert limit == (math.pi if joint == 2 else 2 * math.pi)
+    start = START.copy()
+    start[joint] = sign * (limit - SMALL / 2)
+    dut = Bench(measured=start)
+    desired = start.copy()
+    desired[joint] = sign * (limit + SMALL / 4)
+    position, fault = dut.tick(desired)
+    assert fault == Fault.POSITION_LIMIT
+    np.testing.assert_array_equal(position, start)
+
+
+def test_velocity_limit_is_per_tick():
+    dut = Bench()
+    step = CommandGuardConfig().velocity_limit * COMMAND_PERIOD
+    desired = np.add(START, [0.99 * step, 0, 0, 0, 0, 0])
+    assert dut.tick(desired)[1] == Fault.NONE
+    position, fault = dut.tick(np.add(desired, [0, 0, 0, 0, 0, -1.01 * step]))
+    assert fault == Fault.VELOCITY_LIMIT
+    np.testing.assert_array_equal(position, desired)
+
+
+def test_a_first_command_far_away_is_refused():
+    dut = Bench()
+    position, fault = dut.tick(START + 0.5)
+    assert fault == Fault.VELOCITY_LIMIT
+    np.testing.assert_array_equal(position, START)
+
+
+def test_tracking_error():
+    dut = Bench()
+    limit = CommandGuardConfig().tracking_limit
+    stuck = np.add(START, [0, 0.99 * limit, 0, 0, 0, 0])
+    assert dut.tick(START, stuck)[1] == Fault.NONE
+    stuck = np.add(START, [0, 1.01 * limit, 0, 0, 0, 0])
+    assert dut.tick(START, stuck)[1] == Fault.TRACKING_ERROR
+
+
+def test_fault_is_latched_until_initialization():
+    dut = Bench()
+    dut.tick(np.full(6, math.nan))
+    for _ in range(3):
+        position, fault = dut.tick(START + SMALL)
+        assert fault == Fault.NOT_FINITE
+        np.testing.assert_array_equal(position, START)
+    elsewhere = START + 1.0
+    dut.give(elsewhere, elsewhere)
+    dut.simulator.Initialize()
+    assert dut.fault == Fault.NONE
+    np.testing.assert_array_equal(dut.position, elsewhere)
+
+
+def test_refuses_to_start_without_a_position():
+    with pytest.raises(RuntimeError, match="not finite"):
+        Bench(measured=np.full(6, math.nan))
+
+
+def test_config_loads_from_yaml():
+    config = yaml_load_typed(
+        schema=CommandGuardConfig,
+        data="velocity_limit: 0.5",
+        defaults=CommandGuardConfig(),
+    )
+    assert config.velocity_limit == 0.5
+    assert config.position_limits == CommandGuardConfig().position_limits
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        CommandGuardConfig(velocity_limit=0.0),
+        CommandGuardConfig(tracking_limit=math.nan),
+        CommandGuardConfig(position_limits=[1.0]),
+    ],
+)
+def test_bad_config(config):
+    with pytest.raises(InputError, match="limits"):
+        CommandGuard(config)
