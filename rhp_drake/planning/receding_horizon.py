@@ -1,0 +1,135 @@
+"""RHP: the receding-horizon planner of section VI of the paper, and greedy GP."""
+
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from rhp_drake.planning.policy import Decision, PolicyFailure
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.task import (
+    MAX_ACTIONS,
+    REWARD,
+    allowed_actions,
+    goals_reached,
+    objects_fallen,
+)
+
+# The return of a state from which the goal cannot be reached any more: never within
+# the limit of actions.
+FAILURE_VALUE: Final = REWARD * MAX_ACTIONS
+
+
+class ValueFunction(Protocol):
+    """Whatever estimates q(s, a), e.g. a `QNetwork`."""
+
+    def values(self, states: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Values (N, 6) of states (N, 3 + 3 m) for goals (m, 2)."""
+        ...
+
+
+def masked_values(
+    value_function: ValueFunction, states: np.ndarray, goals: np.ndarray
+) -> np.ndarray:
+    """q(s, a), -inf where the action is not allowed; shape (N, 6)."""
+    q = value_function.values(states, goals)
+    return np.where(allowed_actions(states), q, -np.inf)
+
+
+def sample_softmax(
+    q: np.ndarray, temperature: float, generator: np.random.Generator
+) -> np.ndarray:
+    """Draws an action for each row of q by Eq. 5, the soft-max of q / tau.
+
+    Args:
+        q: Shape (N, 6); -inf has no chance.
+        temperature: tau > 0, in units of return.
+        generator: Draws one number a row.
+    """
+    weights = np.exp((q - q.max(axis=1, keepdims=True)) / temperature)
+    cumulative = weights.cumsum(axis=1)
+    draws = generator.random(len(q)) * cumulative[:, -1]
+    return (cumulative <= draws[:, None]).sum(axis=1)
+
+
+@dataclass(frozen=True)
+class RecedingHorizon:
+    """Simulates n roll-outs of h actions, executes the best one's first action.
+
+    At every step of a roll-out an action is drawn from the soft-max of the values
+    (Eq. 5).  The return of a roll-out is its rewards up to the horizon, plus the
+    largest value there (Eq. 1); a roll-out that reaches the goal ends there.  All
+    roll-outs go forward together: one query of the value function and one batch of
+    the push model a depth, in which equal (state, action) pairs are simulated once.
+
+    With h = 0 this is the greedy policy, GP.
+
+    Attributes:
+        push_model: T, what the roll-outs are simulated in.
+        value_function: q.
+        num_roll_outs: n.
+        horizon: h.
+        temperature: tau, in units of return (one action costs one).
+        discount: gamma.
+    """
+
+    push_model: PushModel
+    value_function: ValueFunction
+    num_roll_outs: int
+    horizon: int
+    temperature: float
+    discount: float = 1.0
+
+    def decide(
+        self,
+        state: np.ndarray,
+        goals: np.ndarray,
+        generator: np.random.Generator,
+        memory: Any = None,  # noqa: ARG002
+    ) -> Decision:
+        """The first action of the best roll-out; see `policy.Policy`."""
+        q = masked_values(self.value_function, state[None], goals)
+        if not np.isfinite(q).any():
+            raise PolicyFailure("no action keeps the hand in the workspace.")
+        if self.horizon == 0:
+            return Decision(int(q[0].argmax()), float(q[0].max()))
+
+        n = self.num_roll_outs
+        states = np.repeat(state[None], n, axis=0)
+        path = [states]
+        returns = np.zeros(n)
+        q = np.repeat(q, n, axis=0)
+        alive = np.ones(n, dtype=bool)
+        first_actions = np.zeros(n, dtype=int)
+        for depth in range(self.horizon):
+            actions = sample_softmax(q, self.temperature, generator)
+            if depth == 0:
+                first_actions = actions
+            states = states.copy()
+            states[alive] = self._step_distinct(states[alive], actions[alive])
+            path.append(states)
+            returns[alive] += self.discount**depth * REWARD
+            fallen = alive & objects_fallen(states)
+            returns[fallen] = FAILURE_VALUE
+            alive &= ~fallen & ~goals_reached(states, goals)
+            if not alive.any():
+                break
+            q = masked_values(self.value_function, states, goals)
+        if alive.any():
+            returns[alive] += self.discount**self.horizon * q[alive].max(axis=1)
+        best = int(returns.argmax())
+        return Decision(
+            int(first_actions[best]),
+            float(returns[best]),
+            np.stack(path, axis=1),
+            returns,
+        )
+
+    def _step_distinct(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """The push model's step, in which equal pairs are simulated once."""
+        pairs = np.column_stack([states, actions])
+        distinct, inverse = np.unique(pairs, axis=0, return_inverse=True)
+        stepped = self.push_model.step(
+            np.ascontiguousarray(distinct[:, :-1]), distinct[:, -1].astype(int)
+        )
+        return stepped[inverse.reshape(-1)]
