@@ -50,6 +50,7 @@ class ObjectPhysics:
             combination, and this field is not used.  Slow pushing hardly sees the
             difference: one and the same factor on all support friction changes no path.
         density: Mass per area seen from above, shape (m,), kg/m^2.
+
     """
 
     side_lengths: np.ndarray
@@ -104,6 +105,7 @@ def draw_physics(
 
     Raises:
         InputError: If the level is unknown, or if nominal boxes overlap in `state`.
+
     """
     if level not in UNCERTAINTY_LEVELS:
         known = ", ".join(UNCERTAINTY_LEVELS)
@@ -156,6 +158,7 @@ def set_object_physics(
 
     Raises:
         InputError: If there are not as many objects as in `physics`.
+
     """
     from pydrake.geometry import Box, ProximityProperties, Role, RoleAssign
     from pydrake.multibody.plant import CoulombFriction

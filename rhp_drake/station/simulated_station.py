@@ -80,6 +80,7 @@ class StationConfig:
         scene_graph: Contact defaults; friction there is the hand's.
         position_gains: Of the joints' servos, N m/rad, base to wrist.
         velocity_gains: Likewise, N m s/rad.
+
     """
 
     directives: list[ModelDirective] = field(default_factory=_default_directives)
@@ -139,6 +140,7 @@ def MakeSimulatedStation(
 
     Raises:
         InputError: If the directives lack the arm, the hand or an object.
+
     """
     robot_builder = RobotDiagramBuilder(time_step=config.plant.time_step)
     builder, plant = robot_builder.builder(), robot_builder.plant()
@@ -224,6 +226,7 @@ def SetStationState(
     Raises:
         InputError: If the station has not m objects, or if the arm cannot reach the
             hand's pose.
+
     """
     objects = station.GetSubsystemByName("object_poses").objects
     if len(state) != 3 + 3 * len(objects):
