@@ -31,6 +31,7 @@ class CommandGuardConfig:
         velocity_limit: Largest change of any joint's command, rad/s.  The arm itself
             stops at pi rad/s.
         tracking_limit: Largest distance of any measured joint from its command, rad.
+
     """
 
     # The elbow turns half as far as the others.

@@ -30,6 +30,7 @@ class _Motion:
         start: Pose (x, y, theta), shape (3,).
         start_velocity: At the start, shape (3,), m/s and rad/s.
         target: Pose, shape (3,).
+
     """
 
     start: np.ndarray
@@ -172,6 +173,7 @@ def _next_step(
     Returns:
         The next time within the motion and the next command, or None if there is no
         way on.
+
     """
     time_step = COMMAND_PERIOD
     try:

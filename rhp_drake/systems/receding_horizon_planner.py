@@ -54,6 +54,7 @@ class DecisionRecord:
         decision: What it decided.
         milliseconds: How long it computed, by the clock on the wall.
         target_distance: From the target object to its goal, m.
+
     """
 
     index: int
@@ -73,6 +74,7 @@ class _Episode:
         sent_time: When, s.
         num_actions: How many actions there were.
         record: The latest decision, None before the first.
+
     """
 
     hand_target: np.ndarray
@@ -124,6 +126,7 @@ class RecedingHorizonPlanner(LeafSystem):
     Args:
         policy: Chooses the actions.
         num_objects: m, the target included.
+
     """
 
     def __init__(self, policy: Policy, num_objects: int) -> None:
@@ -176,6 +179,7 @@ class RecedingHorizonPlanner(LeafSystem):
 
         Raises:
             InputError: If the seed is negative or above `MAX_SEED`.
+
         """
         if not 0 <= seed <= MAX_SEED:
             raise InputError(f"seed {seed} is not in 0 to {MAX_SEED}.")

@@ -49,6 +49,7 @@ class StateEstimator(LeafSystem):
 
     Args:
         num_objects: m, the target included.
+
     """
 
     def __init__(self, num_objects: int) -> None:
