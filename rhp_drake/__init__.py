@@ -1,0 +1,1 @@
+"""Receding-horizon planning with a learned value function, in Drake."""

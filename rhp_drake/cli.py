@@ -1,0 +1,37 @@
+"""The command `rhp`: puts its subcommands together, each from `rhp_drake.commands`."""
+
+import logging
+import sys
+
+import typer
+
+from rhp_drake.commands.run import run
+from rhp_drake.errors import InputError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    # A traceback is for developers; it need not fill the screen with variables.
+    pretty_exceptions_show_locals=False,
+)
+app.command()(run)
+
+
+@app.callback()
+def rhp() -> None:
+    """Receding-horizon planning with a learned value function, in Drake."""
+
+
+def main() -> None:
+    """The entry point: bad input is one sentence on stderr and exit status 2."""
+    # Drake announces Meshcat's address; so do we.
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    try:
+        app()
+    except InputError as error:
+        print(f"rhp: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""Draws the task and the planner's thoughts on the table, in Meshcat."""
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import Cylinder, Meshcat, Rgba
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, EventStatus, LeafSystem
+
+from rhp_drake import task
+from rhp_drake.visualization import FRAME_PERIOD
+
+if TYPE_CHECKING:
+    from rhp_drake.planning.policy import Decision
+
+PATH: Final = "/overlay"
+TARGET_COLOR: Final = (0.20, 0.66, 0.33)
+OBSTACLE_COLOR: Final = (0.80, 0.16, 0.14)
+_HAND_COLOR: Final = np.array([0.10, 0.32, 0.72])
+_PALE: Final = 0.35  # How far towards white the roll-outs not chosen are drawn.
+_OPACITY: Final = 0.3  # Of the goal regions.
+# Heights above the table, m, far enough apart not to flicker.
+_DISC_HEIGHT: Final = 0.002
+_DISC_THICKNESS: Final = 0.0001
+_PATH_HEIGHT: Final = 0.003
+_BEST_HEIGHT: Final = 0.004
+_PATH_WIDTH: Final = 0.004
+_BEST_WIDTH: Final = 0.010
+
+
+class MeshcatOverlay(LeafSystem):
+    """Goal regions as discs, and the last decision's roll-outs as paths on the table.
+
+    A disc is green for the target, red for an obstacle, and stronger while its object
+    is inside.  Of each roll-out the hand's path is blue and the target's green; the
+    roll-out with the highest return is drawn wide and dark.
+
+    Recordings keep properties but no new objects.  So each decision gets objects of
+    its own, under a path with its number, and only their visibility changes in time.
+
+    .. pydrake_system::
+
+        name: MeshcatOverlay
+        input_ports:
+        - state
+        - goals
+        - decision
+
+    `state` has size 3 + 3 m and `goals` 2 m, see `rhp_drake.task`; `decision` is a
+    DecisionRecord, or None before the first decision.
+
+    Args:
+        meshcat: Where to draw.
+        num_objects: m, the target included.
+    """
+
+    def __init__(self, meshcat: Meshcat, num_objects: int) -> None:
+        super().__init__()
+        self._meshcat = meshcat
+        self._state = self.DeclareVectorInputPort("state", 3 + 3 * num_objects)
+        self._goals = self.DeclareVectorInputPort("goals", 2 * num_objects)
+        self._decision = self.DeclareAbstractInputPort(
+            "decision", AbstractValue.Make(None)
+        )
+        self.DeclareInitializationPublishEvent(self._PublishDiscs)
+        self.DeclarePeriodicPublishEvent(FRAME_PERIOD, 0.0, self._PublishChanges)
+
+    def _PublishDiscs(self, context: Context) -> EventStatus:
+        """Draws the goal regions, and forgets the roll-outs of the run before."""
+        self._meshcat.Delete(PATH)
+        goals = self._goals.Eval(context).reshape(-1, 2)
+        disc = Cylinder(task.GOAL_RADIUS, _DISC_THICKNESS)
+        for i, goal in enumerate(goals):
+            color = Rgba(*(OBSTACLE_COLOR if i else TARGET_COLOR), _OPACITY)
+            # Discs may overlap, so each has its own height.
+            height = _DISC_HEIGHT * (1 - i / len(goals))
+            path = _disc_path(i)
+            self._meshcat.SetObject(path, disc, color)
+            self._meshcat.SetTransform(path, RigidTransform([*goal, height]))
+            # A second disc on the first makes its color stronger.
+            self._meshcat.SetObject(f"{path}/reached", disc, color)
+            self._meshcat.SetTransform(
+                f"{path}/reached", RigidTransform([0, 0, 2 * _DISC_THICKNESS])
+            )
+        return EventStatus.Succeeded()
+
+    def _PublishChanges(self, context: Context) -> EventStatus:
+        """Updates the discs' strength, and shows a decision that is new."""
+        time = context.get_time()
+        state = self._state.Eval(context)
+        offsets = task.object_positions(state) - self._goals.Eval(context).reshape(
+            -1, 2
+        )
+        for i, distance in enumerate(np.linalg.norm(offsets, axis=1)):
+            reached = distance <= task.GOAL_RADIUS
+            self._meshcat.SetProperty(
+                f"{_disc_path(i)}/reached", "visible", bool(reached), time
+            )
+        record = self._decision.Eval(context)
+        # Meshcat itself remembers what is drawn, so this system needs no state.
+        if record is not None and not self._meshcat.HasPath(_path(record.index)):
+            self._ShowRollOuts(record.index, record.decision, time)
+        return EventStatus.Succeeded()
+
+    def _ShowRollOuts(self, index: int, decision: "Decision", time: float) -> None:
+        """Draws the roll-outs of decision number `index`, and hides those before."""
+        path = _path(index)
+        # A path without roll-outs still marks the decision as drawn.
+        self._meshcat.SetTransform(path, RigidTransform())
+        order = np.argsort(decision.returns, kind="stable")
+        for rank, i in enumerate(order):
+            best = rank == len(order) - 1
+            self._DrawPath(
+                f"{path}/{i}/hand", decision.roll_outs[i, :, :2], _HAND_COLOR, best
+            )
+            self._DrawPath(
+                f"{path}/{i}/target",
+                decision.roll_outs[i, :, 3:5],
+                np.array(TARGET_COLOR),
+                best,
+            )
+        # Before this time, a recording must not show it.
+        self._meshcat.SetProperty(path, "visible", False, 0.0)
+        self._meshcat.SetProperty(path, "visible", True, time)
+        if self._meshcat.HasPath(_path(index - 1)):
+            self._meshcat.SetProperty(_path(index - 1), "visible", False, time)
+
+    def _DrawPath(
+        self, path: str, points: np.ndarray, color: np.ndarray, best: bool
+    ) -> None:
+        """Draws a ribbon on the table through `points`, shape (k, 2), m in W.
+
+        It is a mesh because WebGL draws all lines one pixel wide.
+        """
+        width = _BEST_WIDTH if best else _PATH_WIDTH
+        height = _BEST_HEIGHT if best else _PATH_HEIGHT
+        if not best:
+            color = color + _PALE * (1 - color)
+        vertices, faces = _ribbon(points, width, height)
+        if faces.size:
+            # The browser takes the colors of vertices to be linear, all others not.
+            colors = np.repeat(color[:, None] ** 2.2, vertices.shape[1], axis=1)
+            self._meshcat.SetTriangleColorMesh(path, vertices, faces, colors)
+
+
+def _disc_path(index: int) -> str:
+    return f"{PATH}/goal/{index}"
+
+
+def _path(index: int) -> str:
+    return f"{PATH}/roll_outs/{index}"
+
+
+def _ribbon(
+    points: np.ndarray, width: float, height: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A flat band along a polyline, as triangles.
+
+    Args:
+        points: Shape (k, 2), m.
+        width: m.
+        height: Of the band, m.
+
+    Returns:
+        Vertices of shape (3, 4 s) and faces of shape (3, 2 s), where s counts the
+        segments that have a length.
+    """
+    start, along = points[:-1], np.diff(points, axis=0)
+    length = np.linalg.norm(along, axis=1)
+    keep = length > 1e-4
+    start, along = start[keep], along[keep]
+    # Half a width longer at both ends, so that bends have no gaps.
+    along_half = along / length[keep, None] * width / 2
+    across_half = along_half[:, ::-1] * [-1, 1]
+    begin, end = start - along_half, start + along + along_half
+    corners = np.stack(
+        [
+            begin + across_half,
+            begin - across_half,
+            end - across_half,
+            end + across_half,
+        ],
+        axis=1,
+    ).reshape(-1, 2)
+    vertices = np.column_stack([corners, np.full(len(corners), height)]).T
+    first = 4 * np.arange(len(start), dtype=np.int32)
+    faces = np.concatenate(
+        [[first, first + 1, first + 2], [first, first + 2, first + 3]], axis=1
+    )
+    return vertices, faces.astype(np.int32)
