@@ -50,7 +50,6 @@ class ObjectPhysics:
             combination, and this field is not used.  Slow pushing hardly sees the
             difference: one and the same factor on all support friction changes no path.
         density: Mass per area seen from above, shape (m,), kg/m^2.
-
     """
 
     side_lengths: np.ndarray
@@ -105,7 +104,6 @@ def draw_physics(
 
     Raises:
         InputError: If the level is unknown, or if nominal boxes overlap in `state`.
-
     """
     if level not in UNCERTAINTY_LEVELS:
         known = ", ".join(UNCERTAINTY_LEVELS)
@@ -118,7 +116,7 @@ def draw_physics(
     if deviation == 0:
         return nominal
 
-    side_range = np.array(SIDE_RANGE) / BOX_SIDE
+    side_range = (SIDE_RANGE[0] / BOX_SIDE, SIDE_RANGE[1] / BOX_SIDE)
     friction, support, density = (
         _draw_factors(deviation, _RELATIVE_RANGE, (m,), generator) for _ in range(3)
     )
@@ -136,6 +134,7 @@ def draw_physics(
 def set_object_physics(
     physics: ObjectPhysics,
     objects: Sequence[str],
+    *,
     plant: "MultibodyPlant",
     plant_context: "Context",
     scene_graph: "SceneGraph",
@@ -158,7 +157,6 @@ def set_object_physics(
 
     Raises:
         InputError: If there are not as many objects as in `physics`.
-
     """
     from pydrake.geometry import Box, ProximityProperties, Role, RoleAssign
     from pydrake.multibody.plant import CoulombFriction
@@ -208,7 +206,7 @@ def set_object_physics(
 
 def _draw_factors(
     deviation: float,
-    limits: Sequence[float],
+    limits: tuple[float, float],
     shape: tuple[int, ...],
     generator: np.random.Generator,
 ) -> np.ndarray:

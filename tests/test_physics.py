@@ -162,8 +162,13 @@ def test_every_geometry_changes_shape():
     scene_graph_context = scene_graph.GetMyMutableContextFromRoot(context)
     plant = diagram.plant()
     plant_context = plant.GetMyMutableContextFromRoot(context)
-    arguments = (plant, plant_context, scene_graph, scene_graph_context)
-    set_object_physics(PHYSICS, objects, *arguments)
+    arguments = {
+        "plant": plant,
+        "plant_context": plant_context,
+        "scene_graph": scene_graph,
+        "scene_graph_context": scene_graph_context,
+    }
+    set_object_physics(PHYSICS, objects, **arguments)
     query_object = scene_graph.get_query_output_port().Eval(scene_graph_context)
     inspector = query_object.inspector()
     for i, name in enumerate(objects):
@@ -174,4 +179,4 @@ def test_every_geometry_changes_shape():
             size = inspector.GetShape(geometry).size()
             np.testing.assert_array_equal(size, [*PHYSICS.side_lengths[i], 0.06])
     with pytest.raises(InputError, match="physics of 3 objects for 2"):
-        set_object_physics(nominal_physics(3), objects, *arguments)
+        set_object_physics(nominal_physics(3), objects, **arguments)

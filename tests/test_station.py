@@ -50,11 +50,12 @@ def sweep(station, simulator, distance, speed) -> None:
     context = simulator.get_mutable_context()
     port = station.GetInputPort("ur5.position")
     pose = planar_state(station, context)[:3]
+    forward = np.array([1, 0, 0])
     num_commands = round(distance / speed / COMMAND_PERIOD)
     start_time = context.get_time()
     for k in range(1, num_commands + 26):
         travel = distance * min(k / num_commands, 1)
-        port.FixValue(context, inverse_kinematics(pose + [travel, 0, 0]))
+        port.FixValue(context, inverse_kinematics(pose + travel * forward))
         simulator.AdvanceTo(start_time + k * COMMAND_PERIOD)
 
 

@@ -28,7 +28,6 @@ class Port:
         size: Number of elements; None if the port is abstract.
         units: Of the elements, or the type of an abstract port.
         simulation_only: Whether hardware cannot have it.
-
     """
 
     name: str

@@ -51,6 +51,9 @@ def _default_directives() -> list[ModelDirective]:
 
 
 def _default_plant() -> MultibodyPlantConfig:
+    # Of the contact settings, this one comes nearest to what is known of slow pushing
+    # (a box turned by a wall, with an ellipsoidal limit surface), and changes least
+    # with the time step; point contact lets boxes sink and tumble.
     return MultibodyPlantConfig(
         time_step=0.004,
         contact_model="hydroelastic_with_fallback",
@@ -80,7 +83,6 @@ class StationConfig:
         scene_graph: Contact defaults; friction there is the hand's.
         position_gains: Of the joints' servos, N m/rad, base to wrist.
         velocity_gains: Likewise, N m s/rad.
-
     """
 
     directives: list[ModelDirective] = field(default_factory=_default_directives)
@@ -140,7 +142,6 @@ def MakeSimulatedStation(
 
     Raises:
         InputError: If the directives lack the arm, the hand or an object.
-
     """
     robot_builder = RobotDiagramBuilder(time_step=config.plant.time_step)
     builder, plant = robot_builder.builder(), robot_builder.plant()
@@ -226,7 +227,6 @@ def SetStationState(
     Raises:
         InputError: If the station has not m objects, or if the arm cannot reach the
             hand's pose.
-
     """
     objects = station.GetSubsystemByName("object_poses").objects
     if len(state) != 3 + 3 * len(objects):
@@ -239,10 +239,12 @@ def SetStationState(
     set_object_physics(
         physics,
         objects,
-        plant,
-        plant_context,
-        scene_graph,
-        station.GetMutableSubsystemContext(scene_graph, station_context),
+        plant=plant,
+        plant_context=plant_context,
+        scene_graph=scene_graph,
+        scene_graph_context=station.GetMutableSubsystemContext(
+            scene_graph, station_context
+        ),
     )
     q = inverse_kinematics(state[:3], PUSHING_HEIGHT)
     plant.SetVelocities(plant_context, np.zeros(plant.num_velocities()))

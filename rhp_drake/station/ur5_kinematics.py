@@ -66,7 +66,6 @@ def forward_kinematics(q: np.ndarray) -> np.ndarray:
 
     Args:
         q: Joint positions, shape (6,), rad.
-
     """
     # `base`, where the DH chain starts, is W turned by half a turn about z.
     X = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -92,7 +91,6 @@ def hand_pose(q: np.ndarray) -> np.ndarray:
 
     Args:
         q: Joint positions that hold the tool about vertical, shape (6,), rad.
-
     """
     X_WH = forward_kinematics(q)
     heading = math.atan2(X_WH[1, 0], X_WH[0, 0])
@@ -116,7 +114,6 @@ def inverse_kinematics(
     Raises:
         InputError: If the arm cannot reach that far or that near, or if wrist 3
             cannot turn that far.
-
     """
     x, y, heading = map(float, hand_pose)
     where = f"hand pose ({x:.3f}, {y:.3f}, {heading:.3f}) at height {height:.3f}"
