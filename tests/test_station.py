@@ -8,7 +8,12 @@ import pytest
 
 from rhp_drake import task
 from rhp_drake.errors import InputError
-from rhp_drake.physics import draw_physics, nominal_physics
+from rhp_drake.physics import (
+    NOMINAL_FRICTION,
+    NOMINAL_SUPPORT_FRICTION,
+    draw_physics,
+    nominal_physics,
+)
 from rhp_drake.random_streams import stream
 from rhp_drake.station.ports import STATION_PORTS, declared_ports
 from rhp_drake.station.position_servo import COMMAND_PERIOD
@@ -79,6 +84,25 @@ def test_table_covers_the_task_s_table(station):
         (centre + half)[:2], task.TABLE_UPPER, rtol=0, atol=1e-12
     )
     assert centre[2] + half[2] == pytest.approx(0, abs=1e-12)
+
+
+def test_nominal_friction(station):
+    query_object = station.GetOutputPort("query_object").Eval(
+        station.CreateDefaultContext()
+    )
+    inspector = query_object.inspector()
+    plant = station.plant()
+
+    def coefficient(body: str) -> float:
+        frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName(body).index())
+        geometry = inspector.GetGeometries(frame, Role.kProximity)[0]
+        properties = inspector.GetProximityProperties(geometry)
+        return properties.GetProperty("material", "coulomb_friction").dynamic_friction()
+
+    # A nominal box meets the hand and the table with these.
+    assert coefficient("hand") == NOMINAL_FRICTION
+    a, b = coefficient("table"), NOMINAL_FRICTION
+    assert 2 * a * b / (a + b) == pytest.approx(NOMINAL_SUPPORT_FRICTION)
 
 
 def test_state_and_physics_are_set(station):
