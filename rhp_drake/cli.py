@@ -1,6 +1,5 @@
 """The command `rhp`: puts its subcommands together, each from `rhp_drake.commands`."""
 
-import logging
 import sys
 
 import typer
@@ -24,8 +23,6 @@ def rhp() -> None:
 
 def main() -> None:
     """The entry point: bad input is one sentence on stderr and exit status 2."""
-    # Drake announces Meshcat's address; so do we.
-    logging.getLogger("drake").setLevel(logging.WARNING)
     try:
         app()
     except InputError as error:

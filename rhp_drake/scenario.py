@@ -115,13 +115,9 @@ def load_scenario(
     """
     path = _find(Path(path))
     document = typed_yaml.read_file(path)
-    for key, node in document.items():
-        if not isinstance(node, dict):
-            raise InputError(
-                f"{path}: {key}: expected a scenario with its name before it, "
-                f"'{key}: {{seed: 3}}', not {node!r}."
-            )
     if name is None:
+        # A file without names would look like one with many scenarios.
+        _check_named(path, document)
         if len(document) > 1:
             raise InputError(
                 f"{path}: has several scenarios, choose one by name: "
@@ -132,6 +128,7 @@ def load_scenario(
         raise InputError(
             f"{path}: has no scenario {name!r}, only {', '.join(document)}."
         )
+    _check_named(path, {name: document[name]})
     where = f"{path}: {name}"
     scenario = typed_yaml.merge(document[name], Scenario(), where)
     for text in overrides:
@@ -143,6 +140,16 @@ def load_scenario(
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return name, scenario
+
+
+def _check_named(path: Path, document: dict[str, Any]) -> None:
+    """Raises InputError unless the document maps names to scenarios."""
+    for key, node in document.items():
+        if not isinstance(node, dict):
+            raise InputError(
+                f"{path}: {key}: expected a scenario with its name before it, "
+                f"'some_name: {{{key}: ...}}', not {node!r}."
+            )
 
 
 def _find(path: Path) -> Path:

@@ -1,6 +1,7 @@
 """`rhp run`: one task in closed loop, in the full diagram of the robot."""
 
 from datetime import datetime
+import logging
 import math
 from pathlib import Path
 import time
@@ -119,6 +120,8 @@ def _run(
     from rhp_drake.scenario import make_task_instance
     from rhp_drake.visualization import FRAME_PERIOD, MakeMeshcat
 
+    # Drake announces Meshcat's address; so do we.
+    logging.getLogger("drake").setLevel(logging.WARNING)
     console = Console(highlight=False, soft_wrap=True)
     instance = make_task_instance(scenario)
     physics = draw_physics(

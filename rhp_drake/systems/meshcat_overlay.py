@@ -65,6 +65,7 @@ class MeshcatOverlay(LeafSystem):
         )
         self.DeclareInitializationPublishEvent(self._PublishDiscs)
         self.DeclarePeriodicPublishEvent(FRAME_PERIOD, 0.0, self._PublishChanges)
+        self.DeclareForcedPublishEvent(self._PublishChanges)
 
     def _PublishDiscs(self, context: Context) -> EventStatus:
         """Draws the goal regions, and forgets the roll-outs of the run before."""
