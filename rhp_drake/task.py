@@ -42,6 +42,8 @@ HAND_RECTANGLES: Final = np.array(
 # every heading.
 WORKSPACE_LOWER: Final = np.array([0.20, -0.30])
 WORKSPACE_UPPER: Final = np.array([0.80, 0.30])
+# m: keeps the arm's small errors from masking the rotations of a hand on the border.
+_BORDER_TOLERANCE: Final = 0.001
 # Wrist 3 turns within +-360 degrees, of which shoulder pan's part (up to 57 degrees
 # either way in this workspace) is not the hand's to use.
 MAX_HEADING: Final = math.radians(300)
@@ -162,9 +164,8 @@ def allowed_actions(states: np.ndarray) -> np.ndarray:
     Roll-outs, learning and execution all take their mask from here.
     """
     targets = hand_targets(states[..., None, :3], np.arange(NUM_ACTIONS))
-    # A micrometre keeps a start on the border, or a rounding error, from masking.
-    inside = (targets[..., :2] >= WORKSPACE_LOWER - 1e-6) & (
-        targets[..., :2] <= WORKSPACE_UPPER + 1e-6
+    inside = (targets[..., :2] >= WORKSPACE_LOWER - _BORDER_TOLERANCE) & (
+        targets[..., :2] <= WORKSPACE_UPPER + _BORDER_TOLERANCE
     )
     return inside.all(axis=-1) & (np.abs(targets[..., 2]) <= MAX_HEADING)
 

@@ -8,6 +8,7 @@ to the node's own target object.
 """
 
 from dataclasses import dataclass
+import math
 import time
 from typing import Any, Final
 
@@ -17,6 +18,7 @@ from rhp_drake.planning.policy import Decision, PolicyFailure
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
+    NUM_ACTIONS,
     ROTATION,
     TRANSLATION,
     WORKSPACE_LOWER,
@@ -29,33 +31,37 @@ from rhp_drake.task import (
 
 # How often the place to grow to is the goal rather than a random one.
 _GOAL_BIAS: Final = 0.75
-# Weights of the distance, in actions: of the hand's way to its pushing pose, and of
-# each obstacle's displacement, against the target's way.
-_HAND_WEIGHT: Final = 0.4
-_OBSTACLE_WEIGHT: Final = 0.5
-# Weight of the actions already taken: plans get shorter, the search longer.
-_DEPTH_WEIGHT: Final = 0.3
+# Weights in the distance, in actions: of the hand's way to its pushing pose, of each
+# obstacle's displacement, and of the actions already taken, against the target's way.
+# Each tree draws its own between these bounds.
+_LIGHTEST: Final = np.array([0.4, 0.5, 0.0])
+_HEAVIEST: Final = np.array([1.0, 1.5, 0.4])
+# Simulated actions after which a tree is given up for a fresh one: the time to a plan
+# is heavy-tailed, and another tree's luck beats this one's patience.
+_RESTART: Final = 1500
 # m: an obstacle this far out of its region is as good as lost.
 _OBSTACLE_LIMIT: Final = 1.5 * GOAL_RADIUS
-# m (rad / 0.1): states closer than this are the same to the planner.
-_DUPLICATE_DISTANCE: Final = 0.004
-# m: where the hand wants H behind the target's centre.
-_PUSHING_OFFSET: Final = 0.01
+# m: states closer than this in every coordinate are the same to the planner...
+_DUPLICATE_DISTANCE: Final = 0.012
+# ...with this many metres to a radian.
+_ANGLE_LENGTH: Final = 0.1
+# m: the hand's opening.
+_OPENING: Final = 0.10
+# rad: how far from the hand's heading it can still push an object in its opening.
+_WIDEST_PUSH: Final = math.radians(100)
 
 
 @dataclass(frozen=True)
-class Tree:
-    """All that was simulated while planning, the pruned children included.
+class Transitions:
+    """T simulated actions.
 
     Attributes:
-        states: States that actions were simulated from, shape (K, 3 + 3 m).
-        parents: For each transition, the index of its state, shape (T,).
+        states: Shape (T, 3 + 3 m).
         actions: Shape (T,).
         next_states: Shape (T, 3 + 3 m).
     """
 
     states: np.ndarray
-    parents: np.ndarray
     actions: np.ndarray
     next_states: np.ndarray
 
@@ -67,13 +73,13 @@ class Plan:
     Attributes:
         actions: Shape (L,); None if no plan was found within the limits.
         states: s_0 ... s_L, shape (L + 1, 3 + 3 m); s_0 alone without a plan.
-        tree: The whole search.
+        search: All that was simulated, the pruned children included.
         seconds: Time it took.
     """
 
     actions: np.ndarray | None
     states: np.ndarray
-    tree: Tree
+    search: Transitions
     seconds: float
 
 
@@ -81,70 +87,118 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _hand_actions(hands: np.ndarray, targets: np.ndarray, place: np.ndarray):
-    """Actions it takes the hands, about, to a pose that pushes to `place`."""
-    way = place - targets
-    heading = np.arctan2(way[:, 1], way[:, 0])
-    direction = np.column_stack([np.cos(heading), np.sin(heading)])
-    offset = hands[:, :2] - (targets - _PUSHING_OFFSET * direction)
-    turn = np.abs(_wrap(hands[:, 2] - heading))
-    return np.linalg.norm(offset, axis=1) / TRANSLATION + turn / ROTATION
+def _hand_actions(
+    hands: np.ndarray, targets: np.ndarray, place: np.ndarray
+) -> np.ndarray:
+    """Actions it takes the hands, about, to a pose that pushes to `place`.
+
+    Such a pose has the target in the hand's opening, which may point anywhere but
+    back: the palm pushes forward, a finger sideways.  Outside, the hand must face
+    the target to let it in.
+    """
+    way, approach = place - targets, targets - hands[:, :2]
+    distance = np.linalg.norm(approach, axis=1)
+    turn = np.abs(_wrap(np.arctan2(way[:, 1], way[:, 0]) - hands[:, 2]))
+    misalignment = np.abs(
+        _wrap(np.arctan2(approach[:, 1], approach[:, 0]) - hands[:, 2])
+    )
+    outside = np.clip(distance / _OPENING - 0.5, 0, 1)
+    return (
+        distance / TRANSLATION
+        + np.maximum(turn - _WIDEST_PUSH, 0) / ROTATION
+        + outside * misalignment / ROTATION
+    )
 
 
-class _Frontier:
-    """The nodes not expanded yet, as arrays that grow."""
+class _Record:
+    """Collects what is simulated."""
 
-    def __init__(self, num_objects: int, goals: np.ndarray) -> None:
-        self._goals = goals
-        self._states = np.empty((256, 3 + 3 * num_objects))
-        self._cost = np.empty(256)
-        self._open = np.zeros(256, dtype=bool)
-        self._keys = np.empty((256, 3 + 3 * num_objects))
-        self.size = 0
+    def __init__(self, state_size: int) -> None:
+        self._states = [np.empty((0, state_size))]
+        self._actions = [np.empty(0, int)]
+        self._next_states = [np.empty((0, state_size))]
+        self.num_transitions = 0
 
-    def add(self, state: np.ndarray, depth: int) -> bool:
-        """Adds a node, unless the tree has nearly the same state."""
-        key = state.copy()
-        key[2::3] *= 0.1
-        known = self._keys[: self.size]
-        if len(known) and (
-            np.abs(known - key).max(axis=1).min() < _DUPLICATE_DISTANCE
-        ):
-            return False
-        if self.size == len(self._open):
-            for name in ("_states", "_cost", "_open", "_keys"):
-                old = getattr(self, name)
-                setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
-        moved = object_positions(state)[1:] - self._goals[1:]
-        self._states[self.size] = state
-        self._keys[self.size] = key
-        self._cost[self.size] = (
-            _OBSTACLE_WEIGHT * np.linalg.norm(moved, axis=1).sum() / TRANSLATION
-            + _DEPTH_WEIGHT * depth
+    def add(self, state: np.ndarray, actions: np.ndarray, children: np.ndarray) -> None:
+        """Adds the children (A, 3 + 3 m) that actions (A,) led to from one state."""
+        self._states.append(np.repeat(state[None], len(actions), axis=0))
+        self._actions.append(actions)
+        self._next_states.append(children)
+        self.num_transitions += len(actions)
+
+    def transitions(self) -> Transitions:
+        """All of them, in order."""
+        return Transitions(
+            np.concatenate(self._states),
+            np.concatenate(self._actions),
+            np.concatenate(self._next_states),
         )
-        self._open[self.size] = True
-        self.size += 1
+
+
+class _Tree:
+    """A growing tree: its nodes, and which of them were not expanded yet."""
+
+    def __init__(
+        self, state: np.ndarray, goals: np.ndarray, generator: np.random.Generator
+    ) -> None:
+        self.goals = goals
+        self._weights = generator.uniform(_LIGHTEST, _HEAVIEST)
+        capacity = _RESTART + NUM_ACTIONS + 1
+        self.states = np.empty((capacity, len(state)))
+        self._keys = np.empty((capacity, len(state)))
+        self._costs = np.empty(capacity)
+        self._open = np.zeros(capacity, dtype=bool)
+        # Of each node: the node and action it came from, and how many actions ago
+        # the tree began.
+        self._parents: list[int] = []
+        self._actions: list[int] = []
+        self._depths: list[int] = []
+        self.add(state, -1, -1)
+
+    def add(self, state: np.ndarray, parent: int, action: int) -> bool:
+        """Adds a node, unless the tree has nearly the same state."""
+        size = len(self._parents)
+        key = state.copy()
+        key[2::3] *= _ANGLE_LENGTH
+        distances = np.abs(self._keys[:size] - key).max(axis=1)
+        if size and distances.min() < _DUPLICATE_DISTANCE:
+            return False
+        depth = self._depths[parent] + 1 if parent >= 0 else 0
+        moved = np.linalg.norm(object_positions(state)[1:] - self.goals[1:], axis=1)
+        self.states[size] = state
+        self._keys[size] = key
+        self._costs[size] = (
+            self._weights[1] * moved.sum() / TRANSLATION + self._weights[2] * depth
+        )
+        self._open[size] = True
+        self._parents.append(parent)
+        self._actions.append(action)
+        self._depths.append(depth)
         return True
 
     def pop_nearest(self, place: np.ndarray) -> int | None:
-        """Takes the node nearest to having the target at `place`."""
-        candidates = np.flatnonzero(self._open[: self.size])
+        """Takes the open node nearest to having the target at `place`."""
+        candidates = np.flatnonzero(self._open)
         if not len(candidates):
             return None
-        states = self._states[candidates]
+        states = self.states[candidates]
         targets = states[:, 3:5]
-        distance = (
+        distances = (
             np.linalg.norm(place - targets, axis=1) / TRANSLATION
-            + _HAND_WEIGHT * _hand_actions(states[:, :3], targets, place)
-            + self._cost[candidates]
+            + self._weights[0] * _hand_actions(states[:, :3], targets, place)
+            + self._costs[candidates]
         )
-        node = candidates[distance.argmin()]
+        node = int(candidates[distances.argmin()])
         self._open[node] = False
-        return int(node)
+        return node
 
-    def state(self, node: int) -> np.ndarray:
-        """The state of a node."""
-        return self._states[node]
+    def plan_to_newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """The actions (L,) and states (L + 1, 3 + 3 m) to the newest node."""
+        path = [len(self._parents) - 1]
+        while self._parents[path[-1]] >= 0:
+            path.append(self._parents[path[-1]])
+        path.reverse()
+        return np.array([self._actions[n] for n in path[1:]], int), self.states[path]
 
 
 def plan(
@@ -167,19 +221,11 @@ def plan(
         time_limit: Limit of computation, s.
     """
     begin = time.perf_counter()
-    frontier = _Frontier(push_model.num_objects, goals)
-    frontier.add(state, 0)
-    depths = [0]
-    # Of each node: the node and action it came from.
-    origins: list[tuple[int, int]] = [(-1, -1)]
-    expanded: list[np.ndarray] = []
-    parents: list[np.ndarray] = []
-    actions: list[np.ndarray] = []
-    next_states: list[np.ndarray] = []
-    num_transitions = 0
-    goal_node = 0 if goals_reached(state, goals) else None
-
-    while goal_node is None and num_transitions < max_transitions:
+    tree = _Tree(state, goals, generator)
+    record = _Record(len(state))
+    found = (np.empty(0, int), state[None]) if goals_reached(state, goals) else None
+    restart_at = _RESTART
+    while found is None and record.num_transitions < max_transitions:
         if time.perf_counter() - begin > time_limit:
             break
         place = (
@@ -187,45 +233,33 @@ def plan(
             if generator.random() < _GOAL_BIAS
             else generator.uniform(WORKSPACE_LOWER, WORKSPACE_UPPER)
         )
-        node = frontier.pop_nearest(place)
-        if node is None:
-            break
-        source = frontier.state(node).copy()
-        tried = np.flatnonzero(allowed_actions(source))
-        children = push_model.step(np.repeat(source[None], len(tried), 0), tried)
-        expanded.append(source)
-        parents.append(np.full(len(tried), len(expanded) - 1))
-        actions.append(tried)
-        next_states.append(children)
-        num_transitions += len(tried)
-
-        moved = object_positions(children)[:, 1:] - goals[1:]
-        lost = (np.linalg.norm(moved, axis=-1) > _OBSTACLE_LIMIT).any(axis=1)
-        lost |= objects_fallen(children)
-        for action, child in zip(tried[~lost], children[~lost], strict=True):
-            if frontier.add(child, depths[node] + 1):
-                depths.append(depths[node] + 1)
-                origins.append((node, int(action)))
-                if goals_reached(child, goals):
-                    goal_node = frontier.size - 1
-                    break
-
-    tree = Tree(
-        np.array(expanded).reshape(-1, len(state)),
-        np.concatenate([*parents, np.empty(0, int)]).astype(np.int32),
-        np.concatenate([*actions, np.empty(0, int)]).astype(np.int8),
-        np.concatenate([*next_states, np.empty((0, len(state)))]),
-    )
+        node = tree.pop_nearest(place)
+        if node is None or record.num_transitions >= restart_at:
+            tree = _Tree(state, goals, generator)
+            restart_at = record.num_transitions + _RESTART
+            continue
+        source = tree.states[node].copy()
+        actions = np.flatnonzero(allowed_actions(source))
+        children = push_model.step(np.repeat(source[None], len(actions), 0), actions)
+        record.add(source, actions, children)
+        found = _grow(tree, node, actions, children)
     seconds = time.perf_counter() - begin
-    if goal_node is None:
-        return Plan(None, state[None], tree, seconds)
-    path, chosen = [goal_node], []
-    while origins[path[-1]][0] >= 0:
-        node, action = origins[path[-1]]
-        path.append(node)
-        chosen.append(action)
-    states = np.array([frontier.state(node) for node in reversed(path)])
-    return Plan(np.array(chosen[::-1], dtype=int), states, tree, seconds)
+    if found is None:
+        return Plan(None, state[None], record.transitions(), seconds)
+    return Plan(*found, record.transitions(), seconds)
+
+
+def _grow(
+    tree: _Tree, node: int, actions: np.ndarray, children: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Adds a node's children, and returns the plan if one of them is a goal."""
+    moved = object_positions(children)[:, 1:] - tree.goals[1:]
+    lost = (np.linalg.norm(moved, axis=-1) > _OBSTACLE_LIMIT).any(axis=1)
+    lost |= objects_fallen(children)
+    for action, child in zip(actions[~lost], children[~lost], strict=True):
+        if tree.add(child, node, int(action)) and goals_reached(child, tree.goals):
+            return tree.plan_to_newest()
+    return None
 
 
 class OpenLoop:
@@ -260,5 +294,3 @@ class OpenLoop:
         if not memory:
             raise PolicyFailure("the plan has ended and the goal is not reached.")
         return Decision(int(memory[0]), -float(len(memory)), memory=memory[1:])
-
-

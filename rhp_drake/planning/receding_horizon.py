@@ -85,7 +85,7 @@ class RecedingHorizon:
         state: np.ndarray,
         goals: np.ndarray,
         generator: np.random.Generator,
-        memory: Any = None,  # noqa: ARG002
+        memory: Any = None,
     ) -> Decision:
         """The first action of the best roll-out; see `policy.Policy`."""
         q = masked_values(self.value_function, state[None], goals)
