@@ -6,13 +6,13 @@ import hashlib
 from importlib.metadata import PackageNotFoundError, version
 import json
 import math
-import os
 from pathlib import Path
 import platform
 from typing import Any, Final
 
 from rhp_drake import typed_yaml
 from rhp_drake.closed_loop import Outcome
+from rhp_drake.files import write_atomically
 from rhp_drake.resources import resolve
 from rhp_drake.scenario import Scenario
 from rhp_drake.systems.receding_horizon_planner import DecisionRecord
@@ -54,16 +54,6 @@ def make_run_record(
 def write_record(path: Path, record: dict[str, Any]) -> None:
     """Writes a record as JSON, all of it or nothing."""
     write_atomically(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Writes under another name and renames, so that no half-written file remains."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _decision_entry(record: DecisionRecord) -> dict[str, Any]:
