@@ -8,12 +8,19 @@ et al. 2016).
 """
 
 from dataclasses import dataclass
+import io
+import json
+from pathlib import Path
+import pickle
 from typing import Final
 
 import numpy as np
 import torch
 
+from rhp_drake.errors import InputError
+from rhp_drake.files import write_atomically
 from rhp_drake.learning.augmentation import Symmetry
+from rhp_drake.learning.demonstrations import Demonstrations
 from rhp_drake.task import (
     GOAL_RADIUS,
     MAX_ACTIONS,
@@ -69,6 +76,16 @@ class Transitions:
     actions: np.ndarray
     next_states: np.ndarray
     goals: np.ndarray
+
+    @classmethod
+    def from_demonstrations(cls, demonstrations: Demonstrations) -> "Transitions":
+        """All that was simulated for the demonstrations."""
+        return cls(
+            demonstrations.search_states,
+            demonstrations.search_actions,
+            demonstrations.search_next_states,
+            demonstrations.goals[demonstrations.search_tasks].astype(np.float32),
+        )
 
 
 def _in_disc(centres: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -139,11 +156,17 @@ class FittedQ:
         network: Its weights are the start.
         config: How.
         generator: Draws the batches, their goals and symmetries.
+
+    Attributes:
+        num_steps: Steps taken so far.
+        mean_loss: Running mean of the loss.
     """
 
     def __init__(
         self, network: QNetwork, config: FittedQConfig, generator: np.random.Generator
     ) -> None:
+        self.num_steps = 0
+        self.mean_loss = 0.0
         self._network = network
         self._config = config
         self._generator = generator
@@ -156,8 +179,8 @@ class FittedQ:
             self._optimizer, config.num_steps
         )
 
-    def step(self, transitions: Transitions) -> float:
-        """One gradient step on a random batch; returns its loss."""
+    def step(self, transitions: Transitions) -> None:
+        """One gradient step on a random batch."""
         config, network = self._config, self._network
         rows = self._generator.integers(len(transitions.actions), size=config.batch_size)
         batch = Transitions(*(array[rows] for array in vars(transitions).values()))
@@ -191,4 +214,46 @@ class FittedQ:
                 self._target.parameters(), network.parameters(), strict=True
             ):
                 ours.lerp_(theirs, config.target_rate)
-        return loss.item()
+        self.num_steps += 1
+        weight = max(1 / self.num_steps, 0.001)
+        self.mean_loss += weight * (loss.item() - self.mean_loss)
+
+    def save(self, path: Path) -> None:
+        """Writes a checkpoint: going on from it is as if never stopped."""
+        buffer = io.BytesIO()
+        torch.save(
+            {
+                "network": self._network.state_dict(),
+                "target": self._target.state_dict(),
+                "optimizer": self._optimizer.state_dict(),
+                "schedule": self._schedule.state_dict(),
+                "generator": json.dumps(self._generator.bit_generator.state),
+                "num_steps": self.num_steps,
+                "mean_loss": self.mean_loss,
+                "config": vars(self._config),
+            },
+            buffer,
+        )
+        write_atomically(path, buffer.getvalue())
+
+    def resume(self, path: Path) -> None:
+        """Goes on from a checkpoint of `save`.
+
+        Raises:
+            InputError: If it cannot be read, or was made with another configuration.
+        """
+        try:
+            saved = torch.load(path, weights_only=True)
+            if saved["config"] != vars(self._config):
+                raise InputError(
+                    f"{path}: a checkpoint of another configuration; delete it to "
+                    "start anew."
+                )
+            self._network.load_state_dict(saved["network"])
+            self._target.load_state_dict(saved["target"])
+            self._optimizer.load_state_dict(saved["optimizer"])
+            self._schedule.load_state_dict(saved["schedule"])
+            self._generator.bit_generator.state = json.loads(saved["generator"])
+            self.num_steps, self.mean_loss = saved["num_steps"], saved["mean_loss"]
+        except (OSError, RuntimeError, KeyError, pickle.UnpicklingError) as error:
+            raise InputError(f"{path}: not a readable checkpoint ({error}).") from error

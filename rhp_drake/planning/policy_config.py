@@ -1,6 +1,8 @@
 """The policies a scenario can name, as plain data, and how they are made."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, TypeAlias
 
 from rhp_drake.errors import InputError
@@ -71,6 +73,14 @@ class OpenLoopConfig:
 
 
 PolicyConfig: TypeAlias = RecedingHorizonConfig | GreedyConfig | OpenLoopConfig
+
+# The policies of the paper's Table I, by short names.
+PAPER_POLICIES: Final[dict[str, Callable[[], PolicyConfig]]] = {
+    "kdp": OpenLoopConfig,
+    "gp": GreedyConfig,
+    "rhp33": partial(RecedingHorizonConfig, num_roll_outs=3, horizon=3),
+    "rhp66": partial(RecedingHorizonConfig, num_roll_outs=6, horizon=6),
+}
 
 
 def MakePolicy(config: PolicyConfig, num_objects: int) -> Policy:

@@ -1,0 +1,89 @@
+"""`rhp evaluate`: policies side by side on a frozen set of instances."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rhp_drake.errors import InputError
+from rhp_drake.planning.policy_config import PAPER_POLICIES, PolicyConfig
+
+
+def evaluate(
+    *,
+    policies: Annotated[
+        str, typer.Option(help=f"Any of {', '.join(PAPER_POLICIES)}.")
+    ] = ",".join(PAPER_POLICIES),
+    instances: Annotated[
+        str, typer.Option(help="The set: evaluation (never tune on it) or validation.")
+    ] = "validation",
+    count: Annotated[int, typer.Option(help="The first so many of the set.")] = 500,
+    world: Annotated[
+        str, typer.Option(help="planar, the push model, or station, the whole robot.")
+    ] = "planar",
+    weights: Annotated[
+        str | None, typer.Option(help="File of the Q-network's weights.")
+    ] = None,
+    temperature: Annotated[
+        float | None, typer.Option(help="tau of RHP's soft-max, in actions.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the policies' random draws.")] = 0,
+    workers: Annotated[int, typer.Option(help="Processes.")] = 2,
+    out: Annotated[
+        Path | None, typer.Option(help="Write every episode to this JSON file.")
+    ] = None,
+) -> None:
+    """Compares policies: success with confidence intervals, actions, time."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from rhp_drake.evaluation.comparison import Comparison, make_table, run_comparison
+    from rhp_drake.evaluation.statistics import describe_machine
+
+    comparison = Comparison(
+        {name: _config(name, weights, temperature) for name in policies.split(",")},
+        instances,
+        count,
+        world,
+        seed,
+    )
+    console = Console()
+    trials = run_comparison(comparison, workers)
+    total = len(comparison.trials())
+    # Sorted: the order in which workers finish means nothing.
+    results = sorted(
+        track(trials, description="Episodes", total=total, console=console),
+        key=lambda result: (
+            list(comparison.policies).index(result[0].policy),
+            result[0].index,
+        ),
+    )
+    title = f"{world} world, first {count} instances of the {instances} set"
+    console.print(make_table(results, title))
+    console.print(describe_machine(workers))
+    if out is not None:
+        _write(out, results)
+
+
+def _config(name: str, weights: str | None, temperature: float | None) -> PolicyConfig:
+    """The named policy of the paper, with other weights or temperature."""
+    if name not in PAPER_POLICIES:
+        raise InputError(
+            f"--policies: {name!r} is not one of {', '.join(PAPER_POLICIES)}."
+        )
+    config = PAPER_POLICIES[name]()
+    if weights is not None and hasattr(config, "q_network"):
+        config.q_network = weights
+    if temperature is not None and hasattr(config, "temperature"):
+        config.temperature = temperature
+    config.validate()
+    return config
+
+
+def _write(path: Path, results: list) -> None:
+    import json
+
+    from rhp_drake.files import write_atomically
+
+    rows = [vars(trial) | vars(episode) for trial, episode in results]
+    write_atomically(path, json.dumps(rows, indent=1) + "\n")

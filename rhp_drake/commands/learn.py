@@ -1,0 +1,176 @@
+"""`rhp demos`, `rhp imitate` and `rhp fit`: from plans to a Q-network."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+# torch and Drake are imported in the functions, so that `rhp --help` is quick.
+if TYPE_CHECKING:
+    from rhp_drake.value.q_network import QNetwork
+
+_Demos = Annotated[Path, typer.Option(help="Folder of demonstrations.")]
+_Plans = Annotated[
+    int | None, typer.Option(help="Use the first so many plans [default: all].")
+]
+_Out = Annotated[Path, typer.Option(help="File of the trained weights.")]
+_Seed = Annotated[int, typer.Option(help="Of all random draws.")]
+
+
+def demos(
+    *,
+    plans: Annotated[int, typer.Option(min=1, help="Training tasks to plan for.")],
+    out: Annotated[Path, typer.Option(help="Folder of the shards.")],
+    seed: _Seed = 0,
+    objects: Annotated[int, typer.Option(min=1, help="m.")] = 3,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+) -> None:
+    """Makes demonstrations: plans of the kinodynamic RRT, and their trees.
+
+    Stopped at any moment, the same command goes on where it was.
+    """
+    from rich.console import Console
+
+    from rhp_drake.learning.demonstrations import (
+        load_demonstrations,
+        make_demonstrations,
+    )
+
+    console = Console()
+    with _progress(console) as progress:
+        bar = progress.add_task("Plans", total=plans)
+        for done in make_demonstrations(out, plans, seed, objects, workers):
+            progress.update(bar, completed=min(done, plans))
+    data = load_demonstrations(out, plans)
+    lengths = data.plan_actions_left[
+        [0, *(1 + (data.plan_tasks[1:] != data.plan_tasks[:-1]).nonzero()[0])]
+    ]
+    console.print(
+        f"{out}: {int(data.solved.sum())} of {len(data.solved)} tasks solved, "
+        f"{lengths.mean():.1f} actions a plan, {len(data.search_actions)} transitions."
+    )
+
+
+def imitate(
+    *,
+    demonstrations: _Demos,
+    out: _Out,
+    plans: _Plans = None,
+    seed: _Seed = 0,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the plans.")] = 200,
+) -> None:
+    """Trains a Q-network on the plans alone, by the paper's Eq. 2 and 3."""
+    from rich.console import Console
+    import torch
+
+    from rhp_drake.learning.demonstrations import load_demonstrations
+    from rhp_drake.learning.imitation import ImitationConfig, imitate
+    from rhp_drake.random_streams import stream
+    from rhp_drake.value.q_network import QNetwork
+
+    console = Console()
+    data = load_demonstrations(demonstrations, plans)
+    config = ImitationConfig(num_epochs=epochs)
+    torch.manual_seed(seed)
+    network = QNetwork(data.goals.shape[1])
+    loss = float("nan")
+    with _progress(console) as progress:
+        bar = progress.add_task("Epochs", total=epochs)
+        for loss in imitate(network, data, config, stream(seed, "imitation")):
+            progress.update(bar, advance=1, description=f"loss {loss:.2f}")
+    _save(network, out, "imitate", data, seed, vars(config) | {"loss": loss}, console)
+
+
+def fit(
+    *,
+    demonstrations: _Demos,
+    start: Annotated[Path, typer.Option(help="Weights to start from.")],
+    out: _Out,
+    plans: _Plans = None,
+    seed: _Seed = 0,
+    steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 30_000,
+) -> None:
+    """Improves a Q-network by double Q-learning on all that the searches simulated.
+
+    Stopped at any moment, the same command goes on from its last checkpoint, a file
+    beside the weights.
+    """
+    from rich.console import Console
+
+    from rhp_drake.learning.demonstrations import load_demonstrations
+    from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, Transitions
+    from rhp_drake.random_streams import stream
+    from rhp_drake.value.q_network import load_q_network
+
+    console = Console()
+    data = load_demonstrations(demonstrations, plans)
+    transitions = Transitions.from_demonstrations(data)
+    network = load_q_network(start, data.goals.shape[1])
+    config = FittedQConfig(num_steps=steps)
+    learner = FittedQ(network, config, stream(seed, "fitted_q"))
+    checkpoint = out.with_name(out.name + ".checkpoint")
+    if checkpoint.exists():
+        learner.resume(checkpoint)
+        console.print(f"Goes on from step {learner.num_steps} of {checkpoint}.")
+    with _progress(console) as progress:
+        bar = progress.add_task("Steps", total=steps, completed=learner.num_steps)
+        while learner.num_steps < steps:
+            learner.step(transitions)
+            if learner.num_steps % 100 == 0:
+                progress.update(
+                    bar,
+                    completed=learner.num_steps,
+                    description=f"loss {learner.mean_loss:.3f}",
+                )
+            if learner.num_steps % 1000 == 0:
+                learner.save(checkpoint)
+    details = vars(config) | {"loss": learner.mean_loss}
+    details["start"] = network.provenance
+    _save(network, out, "fit", data, seed, details, console)
+    checkpoint.unlink(missing_ok=True)
+
+
+def _progress(console: Any) -> Any:
+    """A progress bar with count, rate and time left."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def _save(
+    network: "QNetwork",
+    path: Path,
+    command: str,
+    data: Any,
+    seed: int,
+    details: dict[str, Any],
+    console: Any,
+) -> None:
+    """Writes the weights with where they come from."""
+    from rhp_drake.run_record import source_commit
+
+    network.provenance = {
+        "command": command,
+        "commit": source_commit(),
+        "seed": seed,
+        "plans": len(data.goals),
+        "plans_solved": int(data.solved.sum()),
+        "transitions": len(data.search_actions),
+        **details,
+    }
+    network.save(path)
+    console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

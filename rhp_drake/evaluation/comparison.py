@@ -1,0 +1,133 @@
+"""Policies side by side on the same task instances."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Final
+
+import numpy as np
+from rich.table import Table
+
+from rhp_drake.errors import InputError
+from rhp_drake.evaluation.episode import Episode, run_episode
+from rhp_drake.evaluation.instances import load_instances
+from rhp_drake.evaluation.statistics import format_rate
+from rhp_drake.planning.policy_config import MakePolicy, PolicyConfig
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.workers import run_over
+
+PLANAR: Final = "planar"
+STATION: Final = "station"
+WORLDS: Final = (PLANAR, STATION)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One policy on one instance.
+
+    Attributes:
+        policy: Its name in the table.
+        index: Of the instance in its set.
+    """
+
+    policy: str
+    index: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What to compare.
+
+    Attributes:
+        policies: By their names in the table.
+        instances: Name of a set of instances.
+        num_instances: The first so many of the set.
+        world: "planar", the push model, or "station", the whole robot.
+        seed: Of the policies' random draws.
+    """
+
+    policies: dict[str, PolicyConfig]
+    instances: str
+    num_instances: int
+    world: str
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.world not in WORLDS:
+            raise InputError(f"{self.world!r} is not a world: {', '.join(WORLDS)}.")
+        available = len(load_instances(self.instances))
+        if not 1 <= self.num_instances <= available:
+            raise InputError(
+                f"{self.num_instances} instances were asked for; the {self.instances} "
+                f"set has {available}."
+            )
+
+    def trials(self) -> list[Trial]:
+        """All of them, the policies in turn."""
+        return [
+            Trial(policy, index)
+            for policy in self.policies
+            for index in range(self.num_instances)
+        ]
+
+
+@lru_cache(maxsize=8)
+def _worker_tools(config_text: str) -> dict:  # noqa: ARG001
+    """What a process keeps from trial to trial, by the policy's description."""
+    return {}
+
+
+def _run_trial(trial: Trial, comparison: Comparison) -> Episode:
+    config = comparison.policies[trial.policy]
+    instance = load_instances(comparison.instances)[trial.index]
+    tools = _worker_tools(f"{comparison.world} {config!r}")
+    if not tools:
+        tools["policy"] = MakePolicy(config, instance.num_objects)
+        if comparison.world == PLANAR:
+            tools["world"] = PushModel(instance.num_objects)
+        else:
+            from rhp_drake.evaluation.station_world import StationWorld
+
+            tools["world"] = StationWorld(tools["policy"])
+    if comparison.world == PLANAR:
+        return run_episode(
+            tools["world"], tools["policy"], instance, comparison.seed, trial.index
+        )
+    return tools["world"].run_episode(instance, comparison.seed, trial.index)
+
+
+def run_comparison(
+    comparison: Comparison, num_workers: int
+) -> Iterator[tuple[Trial, Episode]]:
+    """Runs all trials; the episodes are the same whatever the number of workers."""
+    return run_over(
+        partial(_run_trial, comparison=comparison), comparison.trials(), num_workers
+    )
+
+
+def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
+    """A table of success, causes of failure, and cost, a row a policy."""
+    table = Table(title=title)
+    for heading in ("policy", "success % (95 % Wilson)", "actions", "decision p50/p95"):
+        table.add_column(heading, justify="left" if heading == "policy" else "right")
+    table.add_column("computation a run")
+    table.add_column("real-time factor of the world")
+    table.add_column("failures")
+    for policy in dict.fromkeys(trial.policy for trial, _ in results):
+        episodes = [episode for trial, episode in results if trial.policy == policy]
+        successes = [episode for episode in episodes if episode.succeeded]
+        seconds = np.concatenate([e.decision_seconds for e in episodes] or [[0.0]])
+        p50, p95 = 1e3 * np.percentile(seconds, [50, 95])
+        simulated = sum(e.simulated_seconds for e in episodes)
+        factor = simulated / sum(e.world_seconds for e in episodes) if simulated else 0
+        causes = [episode.outcome for episode in episodes if not episode.succeeded]
+        table.add_row(
+            policy,
+            format_rate(len(successes), len(episodes)),
+            f"{np.mean([e.num_actions for e in successes] or [np.nan]):.1f}",
+            f"{p50:.1f} / {p95:.1f} ms",
+            f"{np.mean([sum(e.decision_seconds) for e in successes] or [np.nan]):.2f} s",
+            f"{factor:.1f}" if simulated else "-",
+            ", ".join(f"{causes.count(c)} {c}" for c in dict.fromkeys(causes)),
+        )
+    return table

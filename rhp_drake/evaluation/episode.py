@@ -1,0 +1,69 @@
+"""One closed-loop run of a policy in the planar world."""
+
+from dataclasses import dataclass, field
+import time
+
+import numpy as np
+
+from rhp_drake.planning.policy import Policy, PolicyFailure
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.random_streams import stream
+from rhp_drake.task import MAX_ACTIONS, TaskInstance, goals_reached, objects_fallen
+
+
+@dataclass(frozen=True)
+class Episode:
+    """How a run went.
+
+    Attributes:
+        outcome: "succeeded", "out of actions", "object fell", "policy failed", and in
+            the station whatever else stopped it.
+        num_actions: Actions executed.
+        decision_seconds: Computation of each decision.
+        simulated_seconds: How long it took in the world; 0 where time does not flow.
+        world_seconds: Computation of the world.
+    """
+
+    outcome: str
+    num_actions: int
+    decision_seconds: list[float] = field(default_factory=list)
+    simulated_seconds: float = 0.0
+    world_seconds: float = 0.0
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether every object ended in its goal region."""
+        return self.outcome == "succeeded"
+
+
+def run_episode(
+    world: PushModel, policy: Policy, instance: TaskInstance, seed: int, index: int
+) -> Episode:
+    """Runs a policy on an instance until it ends (section VII of the paper).
+
+    Args:
+        world: Where the actions are executed; the policy has its own model.
+        policy: Chooses them.
+        instance: What to do.
+        seed: Of the experiment.
+        index: Of the instance; decision k draws from stream (index, "decision", k).
+    """
+    state, goals = instance.initial_state, instance.goals
+    memory = None
+    seconds: list[float] = []
+    for k in range(MAX_ACTIONS):
+        begin = time.perf_counter()
+        try:
+            decision = policy.decide(
+                state, goals, stream(seed, index, "decision", k), memory
+            )
+        except PolicyFailure:
+            return Episode("policy failed", k, seconds)
+        seconds.append(time.perf_counter() - begin)
+        memory = decision.memory
+        state = world.step(state[None], np.array([decision.action]))[0]
+        if objects_fallen(state):
+            return Episode("object fell", k + 1, seconds)
+        if goals_reached(state, goals):
+            return Episode("succeeded", k + 1, seconds)
+    return Episode("out of actions", MAX_ACTIONS, seconds)

@@ -1,0 +1,51 @@
+"""Episodes in the station: the robot, its servo and contact in three dimensions."""
+
+import time
+
+from pydrake.systems.analysis import Simulator
+
+from rhp_drake.closed_loop import MakeClosedLoop, run_closed_loop
+from rhp_drake.evaluation.episode import Episode
+from rhp_drake.physics import nominal_physics
+from rhp_drake.planning.policy import Policy
+from rhp_drake.scenario import Scenario
+from rhp_drake.systems.receding_horizon_planner import DecisionRecord
+from rhp_drake.task import TaskInstance
+
+
+class StationWorld:
+    """One closed loop of the default station, which runs instance after instance.
+
+    Args:
+        policy: Who decides.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        scenario = Scenario()
+        self._time_limit = scenario.time_limit
+        self._simulator = Simulator(MakeClosedLoop(scenario, policy))
+
+    def run_episode(self, instance: TaskInstance, seed: int, index: int) -> Episode:
+        """Runs the policy on an instance; see `episode.run_episode`."""
+        seconds: list[float] = []
+
+        def on_decision(record: DecisionRecord) -> None:
+            seconds.append(record.milliseconds / 1e3)
+
+        begin = time.perf_counter()
+        outcome = run_closed_loop(
+            self._simulator,
+            instance,
+            nominal_physics(instance.num_objects),
+            # A task's own seed: the planner's streams know no index of an instance.
+            seed=seed * 1_000_000 + index,
+            time_limit=self._time_limit,
+            on_decision=on_decision,
+        )
+        return Episode(
+            outcome.status.replace("_", " "),
+            outcome.num_actions,
+            seconds,
+            outcome.time,
+            time.perf_counter() - begin - sum(seconds),
+        )
