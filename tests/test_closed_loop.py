@@ -128,11 +128,12 @@ def without_times(record: dict) -> dict:
 
 def test_run_json_and_recording(rhp, tmp_path, capsys):
     short = ("three_boxes", "--seed", "8", "--scenario-text", "{time_limit: 2.5}")
+    short += ("--policy", "rhp33")
     code, record = rhp("first", *short)
     assert code == 1
     printed = capsys.readouterr()
     assert "Meshcat: http://localhost:" in printed.out
-    assert "time limit: not done after 2.5 simulated seconds." in printed.out
+    assert "Time limit: not done after 2.5 simulated seconds." in printed.out
     assert printed.err == ""
     assert "<html>" in (tmp_path / "first" / "recording.html").read_text()
     assert sorted(path.name for path in (tmp_path / "first").iterdir()) == [
@@ -141,6 +142,7 @@ def test_run_json_and_recording(rhp, tmp_path, capsys):
     ]
     assert record["seed"] == 8
     assert record["scenario"]["time_limit"] == 2.5
+    assert record["scenario"]["policy"]["horizon"] == 3
     assert record["versions"]["drake"]
     assert record["outcome"]["num_actions"] == len(record["decisions"]) >= 2
 

@@ -5,9 +5,16 @@ import pytest
 
 from rhp_drake import cli, typed_yaml
 from rhp_drake.errors import InputError
+from rhp_drake.evaluation.instances import SETS, load_instances
 from rhp_drake.planning.policy_config import GreedyConfig, RecedingHorizonConfig
 from rhp_drake.resources import scenarios_path
-from rhp_drake.scenario import Layout, Scenario, load_scenario, make_task_instance
+from rhp_drake.scenario import (
+    Layout,
+    SampledInstance,
+    Scenario,
+    load_scenario,
+    make_task_instance,
+)
 from rhp_drake.task import goals_reached, overlapping_bodies
 
 LAYOUT = """
@@ -70,6 +77,14 @@ def test_seed_chooses_task_unless_index_does(tmp_path):
     assert (state("free", 4) == state("fixed", 1)).all()
     assert (state("fixed", 1) == state("fixed", 2)).all()
     assert (state("free", 1) != state("free", 2)).any()
+
+
+def test_indices_are_those_of_the_frozen_sets():
+    for name in SETS:
+        frozen = load_instances(name)[7]
+        instance = make_task_instance(Scenario(task=SampledInstance(name, 7)))
+        assert (instance.initial_state == frozen.initial_state).all()
+        assert (instance.goals == frozen.goals).all()
 
 
 def test_overrides_in_order(tmp_path):

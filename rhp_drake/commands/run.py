@@ -1,6 +1,8 @@
 """`rhp run`: one task in closed loop, in the full diagram of the robot."""
 
+from dataclasses import asdict
 from datetime import datetime
+import json
 import logging
 import math
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rhp_drake.errors import InputError
+from rhp_drake.planning.policy_config import PAPER_POLICIES
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -18,14 +21,6 @@ if TYPE_CHECKING:
     from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 
 INTERRUPTED: Final = "interrupted"
-
-# The paper's names, as scenario text.
-POLICIES: Final = {
-    "gp": "!GreedyConfig {}",
-    "rhp33": "!RecedingHorizonConfig {num_roll_outs: 3, horizon: 3}",
-    "rhp66": "!RecedingHorizonConfig {num_roll_outs: 6, horizon: 6}",
-    "kdp": "!OpenLoopConfig {}",
-}
 
 
 def run(
@@ -39,7 +34,7 @@ def run(
     seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
     policy: Annotated[
         str | None,
-        typer.Option(help=f"Instead of the scenario's: {', '.join(POLICIES)}."),
+        typer.Option(help=f"Instead of the scenario's: {', '.join(PAPER_POLICIES)}."),
     ] = None,
     scenario_text: Annotated[
         str | None,
@@ -54,7 +49,7 @@ def run(
         typer.Option(help="Write the diagram to this file, and do not run."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results [default: runs/TIME].")
+        Path | None, typer.Option(help="Folder of the results, by default runs/TIME.")
     ] = None,
 ) -> None:
     """Runs one task in closed loop.
@@ -62,12 +57,14 @@ def run(
     Writes run.json and, with Meshcat, recording.html.  The exit status is 0 if the
     task succeeded, 1 if it failed, 2 for bad input, 130 after Ctrl-C.
     """
-    if policy is not None and policy not in POLICIES:
-        raise InputError(f"--policy: {policy!r} is not one of {', '.join(POLICIES)}.")
+    if policy is not None and policy not in PAPER_POLICIES:
+        raise InputError(
+            f"--policy: {policy!r} is not one of {', '.join(PAPER_POLICIES)}."
+        )
     overrides = [
         text
         for text in (
-            f"policy: {POLICIES[policy]}" if policy is not None else None,
+            _policy_text(policy) if policy is not None else None,
             f"seed: {seed}" if seed is not None else None,
             scenario_text,
         )
@@ -85,6 +82,13 @@ def run(
         raise typer.Exit(130)  # What a shell reports for Ctrl-C.
     if not outcome.succeeded:
         raise typer.Exit(1)
+
+
+def _policy_text(name: str) -> str:
+    """A policy of the paper as scenario text, which leaves the weights as they are."""
+    config = PAPER_POLICIES[name]()
+    values = {k: v for k, v in asdict(config).items() if k != "q_network"}
+    return f"policy: !{type(config).__name__} {json.dumps(values)}"
 
 
 def _write_graphviz(scenario: "Scenario", path: Path) -> None:
@@ -113,16 +117,18 @@ def _run(
     from rich.console import Console
 
     from rhp_drake.closed_loop import MakeClosedLoop, Outcome, run_closed_loop
+    from rhp_drake.files import write_atomically
     from rhp_drake.physics import draw_physics
     from rhp_drake.planning.policy_config import MakePolicy
     from rhp_drake.random_streams import stream
-    from rhp_drake.run_record import make_run_record, write_atomically, write_record
+    from rhp_drake.run_record import make_run_record, write_record
     from rhp_drake.scenario import make_task_instance
     from rhp_drake.visualization import FRAME_PERIOD, MakeMeshcat
 
     # Drake announces Meshcat's address; so do we.
     logging.getLogger("drake").setLevel(logging.WARNING)
-    console = Console(highlight=False, soft_wrap=True)
+    # No markup: a message may well have brackets of its own.
+    console = Console(highlight=False, markup=False, soft_wrap=True)
     instance = make_task_instance(scenario)
     physics = draw_physics(
         scenario.world_physics,
@@ -136,13 +142,13 @@ def _run(
         simulator.set_target_realtime_rate(1.0)
     _make_folder(folder)
 
-    console.print(f"[bold]{title}[/bold], seed {scenario.seed}")
+    console.print(f"{title}, seed {scenario.seed}", style="bold")
     if scenario.description:
         console.print(scenario.description)
     if meshcat is not None:
         console.print(f"Meshcat: {meshcat.web_url()}")
         meshcat.StartRecording(frames_per_second=1 / FRAME_PERIOD)
-    console.print("[dim]  #  action             value  thought     to goal[/dim]")
+    console.print("  #  action             value  thought     to goal", style="dim")
 
     decisions: list[DecisionRecord] = []
 
@@ -179,12 +185,13 @@ def _run(
         meshcat.PublishRecording()
         write_atomically(folder / "recording.html", meshcat.StaticHtml())
 
-    color = "green" if outcome.succeeded else "red"
     console.print(
-        f"[bold {color}]{outcome.status.replace('_', ' ')}[/]: {outcome.message} "
+        f"{outcome.status.replace('_', ' ').capitalize()}: {outcome.message}",
+        style="bold green" if outcome.succeeded else "bold red",
+    )
+    console.print(
         f"{outcome.num_actions} actions, {outcome.time:.1f} s simulated in "
-        f"{seconds:.1f} s, the target {100 * outcome.target_distance:.1f} cm from its "
-        "goal."
+        f"{seconds:.1f} s, target {100 * outcome.target_distance:.1f} cm from its goal."
     )
     console.print(f"Results: {folder}")
     return outcome
