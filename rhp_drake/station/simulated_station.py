@@ -1,10 +1,8 @@
 """The simulated station: UR5, hand, table and boxes, with gravity and contact."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.common.value import AbstractValue
 from pydrake.geometry import (
     DefaultProximityProperties,
     Meshcat,
@@ -32,12 +30,13 @@ from pydrake.multibody.plant import (
 )
 from pydrake.multibody.tree import BodyIndex, PdControllerGains
 from pydrake.planning import RobotDiagram, RobotDiagramBuilder
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context
 from pydrake.systems.primitives import Demultiplexer
 
 from rhp_drake.errors import InputError
 from rhp_drake.physics import NOMINAL_FRICTION, ObjectPhysics, set_object_physics
 from rhp_drake.resources import make_package_map
+from rhp_drake.station.object_poses import ObjectPoses
 from rhp_drake.station.ports import JOINT_NAMES, NUM_JOINTS
 from rhp_drake.station.position_servo import PositionServo
 from rhp_drake.station.ur5_kinematics import PUSHING_HEIGHT, inverse_kinematics
@@ -101,34 +100,6 @@ class StationConfig:
     velocity_gains: list[float] = field(
         default_factory=lambda: [600.0, 600.0, 300.0, 40.0, 40.0, 20.0]
     )
-
-
-class ObjectPoses(LeafSystem):
-    """Picks the objects' poses out of all bodies' poses, in task order.
-
-    .. pydrake_system::
-
-        name: ObjectPoses
-        input_ports:
-        - body_poses
-        output_ports:
-        - object_poses
-    """
-
-    def __init__(self, objects: Sequence[str], bodies: Sequence[BodyIndex]) -> None:
-        """Makes the system for the bodies of the objects of these names."""
-        super().__init__()
-        self.objects = tuple(objects)
-        self._bodies = [int(body) for body in bodies]
-        poses = AbstractValue.Make([RigidTransform()])
-        self._body_poses = self.DeclareAbstractInputPort("body_poses", poses)
-        self.DeclareAbstractOutputPort(
-            "object_poses", poses.Clone, self._CalcObjectPoses
-        )
-
-    def _CalcObjectPoses(self, context: Context, output: AbstractValue) -> None:
-        body_poses = self._body_poses.Eval(context)
-        output.set_value([body_poses[body] for body in self._bodies])
 
 
 def MakeSimulatedStation(
