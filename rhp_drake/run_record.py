@@ -8,6 +8,7 @@ import json
 import math
 from pathlib import Path
 import platform
+import subprocess
 from typing import Any, Final
 
 from rhp_drake import typed_yaml
@@ -56,6 +57,24 @@ def write_record(path: Path, record: dict[str, Any]) -> None:
     write_atomically(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
+def source_commit() -> str:
+    """The commit of the checkout that this code is in, "unknown" outside of one.
+
+    "-dirty" follows it if the checkout has been changed since.
+    """
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return "unknown"
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        result = subprocess.run(
+            command, cwd=root, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return result.stdout.strip()
+
+
 def _decision_entry(record: DecisionRecord) -> dict[str, Any]:
     decision = record.decision
     return {
@@ -76,7 +95,10 @@ def _finite(value: float) -> float | None:
 
 
 def _versions() -> dict[str, str | None]:
-    versions: dict[str, str | None] = {"python": platform.python_version()}
+    versions: dict[str, str | None] = {
+        "commit": source_commit(),
+        "python": platform.python_version(),
+    }
     for package in _PACKAGES:
         try:
             versions[package] = version(package)
