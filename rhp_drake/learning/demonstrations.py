@@ -45,6 +45,7 @@ class Demonstrations:
         search_states: Shape (T, 3 + 3 m).
         search_actions: Shape (T,).
         search_next_states: Shape (T, 3 + 3 m).
+        search_origins: For each transition, which one led to its state; -1 at a root.
         num_transitions: Of each task's search, shape (P,).
         solved: Whether each task has a plan, shape (P,).
     """
@@ -58,20 +59,30 @@ class Demonstrations:
     search_states: np.ndarray
     search_actions: np.ndarray
     search_next_states: np.ndarray
+    search_origins: np.ndarray
     num_transitions: np.ndarray
     solved: np.ndarray
 
 
-_TASK_INDICES: Final = ("plan_tasks", "search_tasks")
+# Arrays that hold indices, and the array whose rows they count.
+_INDICES: Final = {
+    "plan_tasks": "goals",
+    "search_tasks": "goals",
+    "search_origins": "search_actions",
+}
 
 
 def _concatenate(parts: list[Demonstrations]) -> Demonstrations:
     arrays = {}
-    offsets = np.cumsum([0] + [len(part.goals) for part in parts[:-1]])
     for field in fields(Demonstrations):
         values = [getattr(part, field.name) for part in parts]
-        if field.name in _TASK_INDICES:
-            values = [v + o for v, o in zip(values, offsets, strict=True)]
+        if field.name in _INDICES:
+            lengths = [len(getattr(part, _INDICES[field.name])) for part in parts]
+            offsets = np.cumsum([0, *lengths[:-1]], dtype=np.int32)
+            values = [
+                np.where(value < 0, value, value + offset)
+                for value, offset in zip(values, offsets, strict=True)
+            ]
         arrays[field.name] = np.concatenate(values)
     return Demonstrations(**arrays)
 
@@ -99,6 +110,7 @@ def demonstrate(push_model: PushModel, seed: int, index: int) -> Demonstrations:
         search_states=search.states.astype(np.float32),
         search_actions=search.actions.astype(np.int8),
         search_next_states=search.next_states.astype(np.float32),
+        search_origins=search.origins.astype(np.int32),
         num_transitions=np.array([len(search.actions)]),
         solved=np.array([solved]),
     )

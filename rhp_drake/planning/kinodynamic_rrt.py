@@ -59,11 +59,13 @@ class Transitions:
         states: Shape (T, 3 + 3 m).
         actions: Shape (T,).
         next_states: Shape (T, 3 + 3 m).
+        origins: For each, which one led to its state; -1 at a root.  Shape (T,).
     """
 
     states: np.ndarray
     actions: np.ndarray
     next_states: np.ndarray
+    origins: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -117,14 +119,28 @@ class _Record:
         self._states = [np.empty((0, state_size))]
         self._actions = [np.empty(0, int)]
         self._next_states = [np.empty((0, state_size))]
+        self._origins = [np.empty(0, int)]
         self.num_transitions = 0
 
-    def add(self, state: np.ndarray, actions: np.ndarray, children: np.ndarray) -> None:
-        """Adds the children (A, 3 + 3 m) that actions (A,) led to from one state."""
+    def add(
+        self,
+        state: np.ndarray,
+        actions: np.ndarray,
+        children: np.ndarray,
+        origin: int,
+    ) -> np.ndarray:
+        """Adds the children (A, 3 + 3 m) that actions (A,) led to from one state.
+
+        Returns:
+            The transitions' indices, shape (A,).
+        """
         self._states.append(np.repeat(state[None], len(actions), axis=0))
         self._actions.append(actions)
         self._next_states.append(children)
+        self._origins.append(np.full(len(actions), origin))
+        first = self.num_transitions
         self.num_transitions += len(actions)
+        return np.arange(first, self.num_transitions)
 
     def transitions(self) -> Transitions:
         """All of them, in order."""
@@ -132,6 +148,7 @@ class _Record:
             np.concatenate(self._states),
             np.concatenate(self._actions),
             np.concatenate(self._next_states),
+            np.concatenate(self._origins),
         )
 
 
@@ -153,9 +170,13 @@ class _Tree:
         self._parents: list[int] = []
         self._actions: list[int] = []
         self._depths: list[int] = []
-        self.add(state, -1, -1)
+        # The transition of the search that each node is the end of, -1 for the root.
+        self.transitions: list[int] = []
+        self.add(state, -1, -1, -1)
 
-    def add(self, state: np.ndarray, parent: int, action: int) -> bool:
+    def add(
+        self, state: np.ndarray, parent: int, action: int, transition: int
+    ) -> bool:
         """Adds a node, unless the tree has nearly the same state."""
         size = len(self._parents)
         key = state.copy()
@@ -173,6 +194,7 @@ class _Tree:
         self._open[size] = True
         self._parents.append(parent)
         self._actions.append(action)
+        self.transitions.append(transition)
         self._depths.append(depth)
         return True
 
@@ -241,8 +263,8 @@ def plan(
         source = tree.states[node].copy()
         actions = np.flatnonzero(allowed_actions(source))
         children = push_model.step(np.repeat(source[None], len(actions), 0), actions)
-        record.add(source, actions, children)
-        found = _grow(tree, node, actions, children)
+        indices = record.add(source, actions, children, tree.transitions[node])
+        found = _grow(tree, node, actions, children, indices)
     seconds = time.perf_counter() - begin
     if found is None:
         return Plan(None, state[None], record.transitions(), seconds)
@@ -250,14 +272,20 @@ def plan(
 
 
 def _grow(
-    tree: _Tree, node: int, actions: np.ndarray, children: np.ndarray
+    tree: _Tree,
+    node: int,
+    actions: np.ndarray,
+    children: np.ndarray,
+    indices: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Adds a node's children, and returns the plan if one of them is a goal."""
     moved = object_positions(children)[:, 1:] - tree.goals[1:]
     lost = (np.linalg.norm(moved, axis=-1) > _OBSTACLE_LIMIT).any(axis=1)
     lost |= objects_fallen(children)
-    for action, child in zip(actions[~lost], children[~lost], strict=True):
-        if tree.add(child, node, int(action)) and goals_reached(child, tree.goals):
+    for i in np.flatnonzero(~lost):
+        child = children[i]
+        added = tree.add(child, node, int(actions[i]), int(indices[i]))
+        if added and goals_reached(child, tree.goals):
             return tree.plan_to_newest()
     return None
 

@@ -28,12 +28,13 @@ from rhp_drake.task import BOX_SIDE
 # s.  One step of the contact solver, in which the hand travels 5 mm or 3 degrees
 # (`transition.STEPS_PER_ACTION`).
 TIME_STEP: Final = 0.05
-# Friction coefficient between bodies: section VII of the paper.
-FRICTION: Final = 0.3
 # kg: so heavy that no push changes its velocity; the hand then needs no actuators.
 _HAND_MASS: Final = 1000.0
 # s: time constant of a released box, well under a time step.
 _STOPPING_TIME: Final = 0.01
+# s: how fast an overlap is pushed out.  Drake's default of 0.1 s is as long as two time
+# steps: the palm would sink 1 cm into a box at a push.
+_RELAXATION_TIME: Final = 0.005
 # Largest frictional torque over largest frictional force under a uniformly loaded
 # square of side 1: the mean distance of its points from its centre.
 _LIMIT_SURFACE_LENGTH: Final = 0.3826
@@ -59,9 +60,10 @@ def MakePushDiagram(num_objects: int, time_step: float = TIME_STEP) -> RobotDiag
         ),
         plant,
     )
+    # Friction comes with the models.
     scene_graph_config = SceneGraphConfig()
-    scene_graph_config.default_proximity_properties.dynamic_friction = FRICTION
-    scene_graph_config.default_proximity_properties.static_friction = FRICTION
+    properties = scene_graph_config.default_proximity_properties
+    properties.relaxation_time = _RELAXATION_TIME
     builder.scene_graph().set_config(scene_graph_config)
     plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
 

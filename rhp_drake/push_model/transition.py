@@ -24,6 +24,9 @@ from rhp_drake.task import (
 
 # An action's path is cut into this many equal pieces; each is one time step.
 STEPS_PER_ACTION: Final = 10
+# Time steps in which the hand stands at its target: contact is found at the beginning
+# of a step, so the last one of the motion may leave an overlap.
+_SETTLING_STEPS: Final = 1
 # m: what two bodies at rest in contact may overlap, an error of the contact solver.
 _CONTACT_TOLERANCE: Final = 2e-4
 
@@ -116,11 +119,11 @@ class PushModel:
         self.num_objects = num_objects
         self._refinement = refinement
         self._time_step = TIME_STEP / refinement
-        self._diagram = MakePushDiagram(num_objects, self._time_step)
-        self._plant = self._diagram.plant()
-        context = MakePushContext(self._diagram)
+        self.diagram = MakePushDiagram(num_objects, self._time_step)
+        self._plant = self.diagram.plant()
+        context = MakePushContext(self.diagram)
         self._simulators = [
-            Simulator(self._diagram, context.Clone()) for _ in range(num_threads)
+            Simulator(self.diagram, context.Clone()) for _ in range(num_threads)
         ]
         self._threads = ThreadPoolExecutor(num_threads) if num_threads > 1 else None
 
@@ -188,6 +191,7 @@ class PushModel:
         plant_context = self._plant.GetMyMutableContextFromRoot(context)
         num_positions = states.shape[1]
         start = np.zeros(2 * num_positions)
+        rest = np.zeros(num_positions)
         duration = STEPS_PER_ACTION * TIME_STEP
         for column in columns:
             start[:num_positions] = states[column]
@@ -199,8 +203,12 @@ class PushModel:
                 context.SetTime(0.0)
                 self._plant.SetPositionsAndVelocities(plant_context, start)
                 simulator.Initialize()
-                # Half a step less than `steps` periods: exactly `steps` updates,
+                # Half a step less than so many periods: exactly so many updates,
                 # whatever the rounding.
+                simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
+                # The hand stands; what it still overlaps comes out.
+                self._plant.SetVelocities(plant_context, rest)
+                steps += _SETTLING_STEPS * self._refinement
                 simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
             except (RuntimeError, SystemExit) as error:
                 # Drake's assertions arrive as SystemExit.

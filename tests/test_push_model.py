@@ -1,0 +1,164 @@
+"""The push model: against finer physics, against what is exact, and its bits."""
+
+import numpy as np
+import pytest
+
+from rhp_drake.planar_geometry import rectangles_overlap
+from rhp_drake.push_model.transition import (
+    STEPS_PER_ACTION,
+    PushModel,
+    first_touches,
+)
+from rhp_drake.random_streams import stream
+from rhp_drake.task import (
+    HAND_RECTANGLES,
+    NUM_ACTIONS,
+    Action,
+    hand_targets,
+    object_positions,
+    overlapping_bodies,
+    sample_instance,
+    state_rectangles,
+)
+
+# A box inside the hand's opening, two far away.
+CAGED = np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.3, 0.2, 0.5, 0.7, 0.25, 0.0])
+
+
+@pytest.fixture(scope="module")
+def push_model():
+    return PushModel(3)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """States with the hand near a box, and actions."""
+    generator = stream(0, "test_push_model")
+    states = []
+    while len(states) < 120:
+        state = sample_instance(generator).initial_state.copy()
+        state[:2] = state[3:5] + generator.uniform(-0.1, 0.1, size=2)
+        if not overlapping_bodies(state):
+            states.append(state)
+    return np.array(states), generator.integers(NUM_ACTIONS, size=len(states))
+
+
+def test_models_and_task_describe_the_same_hand_and_box(push_model):
+    plant = push_model.diagram.plant()
+    inspector = push_model.diagram.scene_graph().model_inspector()
+    hand = plant.GetBodyByName("hand")
+    ids = plant.GetCollisionGeometriesForBody(hand)
+    described = sorted(
+        [
+            *inspector.GetPoseInFrame(i).translation()[:2],
+            *(inspector.GetShape(i).size()[:2] / 2),
+        ]
+        for i in ids
+    )
+    np.testing.assert_allclose(described, sorted(HAND_RECTANGLES.tolist()))
+
+
+def test_untouched_boxes_stay_and_the_hand_arrives(push_model):
+    state = CAGED.copy()
+    state[:2] = [0.3, -0.2]
+    for action in Action:
+        after = push_model.step(state[None], np.array([action]))[0]
+        np.testing.assert_array_equal(after[3:], state[3:])
+        np.testing.assert_array_equal(after[:3], hand_targets(state, action))
+
+
+def test_palm_pushes_the_box_as_far_as_geometry_says(push_model):
+    after = push_model.step(CAGED[None], np.array([Action.FORWARD]))[0]
+    # The palm is 1 cm behind the box: of 5 cm, 4 push.
+    np.testing.assert_allclose(after[3:5], [0.54, 0.0], atol=2e-3)
+    assert abs(after[5]) < 0.02
+    np.testing.assert_array_equal(after[6:], CAGED[6:])
+
+
+def test_finger_drags_the_box_sideways(push_model):
+    after = push_model.step(CAGED[None], np.array([Action.LEFT]))[0]
+    # The finger is 2 cm beside the box: of 5 cm, 3 push.
+    np.testing.assert_allclose(after[3:5], [0.5, 0.03], atol=2e-3)
+    assert abs(after[5]) < 0.02
+
+
+def test_pushes_are_near_those_of_twenty_times_finer_steps(push_model, pairs):
+    states, actions = pairs
+    reference = PushModel(3, refinement=20).step(states, actions)
+    after = push_model.step(states, actions)
+    moved = (
+        np.linalg.norm(object_positions(reference) - object_positions(states), axis=-1)
+        > 1e-3
+    )
+    errors = np.linalg.norm(
+        object_positions(reference) - object_positions(after), axis=-1
+    )[moved]
+    assert moved.sum() > 40
+    assert errors.mean() < 0.0015
+    assert np.percentile(errors, 95) < 0.004
+
+
+def test_bodies_do_not_end_up_inside_each_other(push_model, pairs):
+    for state in push_model.step(*pairs):
+        rectangles = state_rectangles(state)
+        rectangles[:, 3:] -= 0.001
+        for i in range(3, len(rectangles)):
+            for j in range(i):
+                assert not rectangles_overlap(rectangles[i], rectangles[j])
+
+
+def test_bits_do_not_depend_on_batch_order_or_threads(push_model, pairs):
+    states, actions = pairs
+    expected = push_model.step(states, actions)
+    order = stream(1, "order").permutation(len(states))
+    np.testing.assert_array_equal(
+        push_model.step(states[order], actions[order]), expected[order]
+    )
+    with PushModel(3, num_threads=2) as threaded:
+        np.testing.assert_array_equal(threaded.step(states, actions), expected)
+    one_by_one = [
+        push_model.step(states[i : i + 1], actions[i : i + 1])[0] for i in range(20)
+    ]
+    np.testing.assert_array_equal(one_by_one, expected[:20])
+
+
+def test_what_is_not_touched_needs_no_physics(push_model, pairs):
+    """The swept test never misses a touch that the physics would see."""
+    states, actions = pairs
+    touches = first_touches(states, actions)
+    free = touches == STEPS_PER_ACTION
+    assert 0 < free.sum() < len(free)
+    fractions = np.linspace(0, 1, 101)
+    for state, action, touch in zip(states, actions, touches, strict=True):
+        motion = hand_targets(state, action) - state[:3]
+        moving = state.copy()
+        for fraction in fractions[fractions < touch / STEPS_PER_ACTION]:
+            moving[:3] = state[:3] + fraction * motion
+            assert not overlapping_bodies(moving, -5e-4)
+
+
+def test_mirror_image_of_a_push(push_model, pairs):
+    states, _ = pairs
+    mirror = np.tile([1.0, -1.0, -1.0], 4)
+    left = np.full(len(states), Action.LEFT)
+    right = np.full(len(states), Action.RIGHT)
+    after = push_model.step(states, left)
+    mirrored = push_model.step(states * mirror, right) * mirror
+    difference = np.linalg.norm(
+        object_positions(after) - object_positions(mirrored), axis=-1
+    )
+    assert np.median(difference) < 1e-4
+    assert difference.mean() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("states", "actions", "message"),
+    [
+        (np.zeros((2, 9)), np.zeros(2, int), r"shape \(N, 12\)"),
+        (np.zeros((2, 12)), np.zeros(3, int), "as many actions"),
+        (np.full((2, 12), np.nan), np.zeros(2, int), "state 0 .* not finite"),
+    ],
+)
+def test_bad_batches_are_refused(push_model, states, actions, message):
+    with pytest.raises(ValueError, match=message):
+        push_model.step(states, actions)
