@@ -169,7 +169,7 @@ def run_closed_loop(
         # Between two calls Python handles Ctrl-C, so Drake need not look for it.
         simulator.AdvanceTo(ticks * PLANNER_PERIOD, interruptible=False)
         record = decision.Eval(context)
-        if record is not None and record.index == num_actions:
+        if record.index == num_actions:
             num_actions += 1
             on_decision(record)
         planner_status = Status(int(status.Eval(context)[0]))

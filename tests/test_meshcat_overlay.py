@@ -6,7 +6,7 @@ from rhp_drake import task
 from rhp_drake.planning.policy import Decision
 from rhp_drake.random_streams import stream
 from rhp_drake.systems.meshcat_overlay import MeshcatOverlay, _ribbon
-from rhp_drake.systems.receding_horizon_planner import DecisionRecord
+from rhp_drake.systems.receding_horizon_planner import NO_DECISION, DecisionRecord
 
 
 class FakeMeshcat:
@@ -73,7 +73,7 @@ def publish(overlay, instance, time, decision_record, initialize=False):
 def test_discs_and_roll_outs(instance):
     meshcat = FakeMeshcat()
     overlay = MeshcatOverlay(meshcat, 3)
-    publish(overlay, instance, 0.0, None, initialize=True)
+    publish(overlay, instance, 0.0, NO_DECISION, initialize=True)
     discs = {f"/overlay/goal/{i}{part}" for i in range(3) for part in ("", "/reached")}
     assert meshcat.paths == discs
     # Only the obstacles start in their regions.
@@ -99,7 +99,7 @@ def test_discs_and_roll_outs(instance):
         1.0: False,
     }
 
-    publish(overlay, instance, 0.0, None, initialize=True)
+    publish(overlay, instance, 0.0, NO_DECISION, initialize=True)
     assert meshcat.paths == discs
 
 

@@ -104,7 +104,7 @@ class Bench:
 def test_before_the_first_decision():
     bench = Bench(Script())
     np.testing.assert_array_equal(bench.hand_target, HAND)
-    assert bench.decision is None
+    assert bench.decision.index == -1
     assert bench.status == Status.RUNNING
     assert bench.message == ""
 
@@ -262,7 +262,7 @@ def test_contexts_do_not_share_episodes():
     fresh = bench.context.Clone()
     bench.run()
     assert bench.status == Status.POLICY_FAILED
-    assert bench.dut.GetOutputPort("decision").Eval(fresh) is None
+    assert bench.dut.GetOutputPort("decision").Eval(fresh).index == -1
     assert bench.dut.GetOutputPort("status").Eval(fresh)[0] == Status.RUNNING
 
 
@@ -275,7 +275,7 @@ def test_initialization_starts_a_new_episode():
     bench.give(STATE, at_rest=True)
     bench.simulator.Initialize()
     assert bench.status == Status.RUNNING
-    assert bench.decision is None
+    assert bench.decision.index == -1
     np.testing.assert_array_equal(bench.hand_target, HAND)
     # The seed stays.
     assert [r.decision.action for r in bench.run()] == first

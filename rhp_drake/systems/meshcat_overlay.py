@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from rhp_drake import task
+from rhp_drake.systems.receding_horizon_planner import NO_DECISION
 from rhp_drake.visualization import FRAME_PERIOD
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class MeshcatOverlay(LeafSystem):
         - decision
 
     `state` has size 3 + 3 m and `goals` 2 m, see `rhp_drake.task`; `decision` is a
-    DecisionRecord, or None before the first decision.
+    DecisionRecord, see `RecedingHorizonPlanner`.
 
     Args:
         meshcat: Where to draw.
@@ -61,7 +62,7 @@ class MeshcatOverlay(LeafSystem):
         self._state = self.DeclareVectorInputPort("state", 3 + 3 * num_objects)
         self._goals = self.DeclareVectorInputPort("goals", 2 * num_objects)
         self._decision = self.DeclareAbstractInputPort(
-            "decision", AbstractValue.Make(None)
+            "decision", AbstractValue.Make(NO_DECISION)
         )
         self.DeclareInitializationPublishEvent(self._PublishDiscs)
         self.DeclarePeriodicPublishEvent(FRAME_PERIOD, 0.0, self._PublishChanges)
@@ -100,7 +101,7 @@ class MeshcatOverlay(LeafSystem):
             )
         record = self._decision.Eval(context)
         # Meshcat itself remembers what is drawn, so this system needs no state.
-        if record is not None and not self._meshcat.HasPath(_path(record.index)):
+        if record.index >= 0 and not self._meshcat.HasPath(_path(record.index)):
             self._ShowRollOuts(record.index, record.decision, time)
         return EventStatus.Succeeded()
 

@@ -65,6 +65,17 @@ class DecisionRecord:
     target_distance: float
 
 
+# Before the first decision.  Newer Drake's abstract values do not take None.
+NO_DECISION: Final = DecisionRecord(
+    index=-1,
+    time=0.0,
+    state=np.empty(0),
+    decision=Decision(action=-1, value=np.nan),
+    milliseconds=0.0,
+    target_distance=np.nan,
+)
+
+
 @dataclass(frozen=True)
 class _Episode:
     """The planner's state: all that changes in the course of an episode.
@@ -119,9 +130,9 @@ class RecedingHorizonPlanner(LeafSystem):
 
     `state` has size 3 + 3 m, see `rhp_drake.task`; `at_rest` has size 1 and is 0 or
     1; `goals` has size 2 m, the rows of an (m, 2) array one after the other.
-    `hand_target` has size 3, a pose of the hand; `decision` is a `DecisionRecord`, or
-    None before the first; `status` has size 1, a value of `Status`; `message` is a
-    string that says why the episode ended.
+    `hand_target` has size 3, a pose of the hand; `decision` is a `DecisionRecord`,
+    `NO_DECISION` before the first; `status` has size 1, a value of `Status`; `message`
+    is a string that says why the episode ended.
 
     Args:
         policy: Chooses the actions.
@@ -153,7 +164,7 @@ class RecedingHorizonPlanner(LeafSystem):
         )
         self.DeclareAbstractOutputPort(
             name="decision",
-            alloc=lambda: AbstractValue.Make(None),
+            alloc=lambda: AbstractValue.Make(NO_DECISION),
             calc=self._CalcDecision,
             prerequisites_of_calc=prerequisites,
         )
@@ -192,7 +203,7 @@ class RecedingHorizonPlanner(LeafSystem):
         output.SetFromVector(self._get_episode(context).hand_target)
 
     def _CalcDecision(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(self._get_episode(context).record)
+        output.set_value(self._get_episode(context).record or NO_DECISION)
 
     def _CalcStatus(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(self._get_episode(context).status))
