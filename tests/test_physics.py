@@ -11,6 +11,7 @@ import pytest
 from rhp_drake import task
 from rhp_drake.errors import InputError
 from rhp_drake.physics import (
+    NOMINAL_FRICTION,
     SIDE_RANGE,
     UNCERTAINTY_LEVELS,
     ObjectPhysics,
@@ -97,14 +98,9 @@ def box_sdf(physics: ObjectPhysics, i: int) -> str:
         old = f"<i{axis}>0.00009</i{axis}>"
         assert old in text
         text = text.replace(old, f"<i{axis}>{mass * square / 12!r}</i{axis}>")
-    mu = physics.friction[i]
-    return text.replace(
-        "</geometry>\n      </collision>",
-        "</geometry><drake:proximity_properties>"
-        f"<drake:mu_static>{mu}</drake:mu_static>"
-        f"<drake:mu_dynamic>{mu}</drake:mu_dynamic>"
-        "</drake:proximity_properties></collision>",
-    )
+    nominal = f">{NOMINAL_FRICTION}</drake:mu_"
+    assert text.count(nominal) == 2
+    return text.replace(nominal, f">{physics.friction[i]}</drake:mu_")
 
 
 def make_stack(physics: ObjectPhysics | None):

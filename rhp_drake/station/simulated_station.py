@@ -8,10 +8,8 @@ from pydrake.geometry import (
     Meshcat,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
-    ProximityProperties,
     Rgba,
     Role,
-    RoleAssign,
     SceneGraph,
     SceneGraphConfig,
 )
@@ -24,7 +22,6 @@ from pydrake.multibody.parsing import (
 )
 from pydrake.multibody.plant import (
     ApplyMultibodyPlantConfig,
-    CoulombFriction,
     MultibodyPlant,
     MultibodyPlantConfig,
 )
@@ -34,7 +31,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.primitives import Demultiplexer
 
 from rhp_drake.errors import InputError
-from rhp_drake.physics import NOMINAL_FRICTION, ObjectPhysics, set_object_physics
+from rhp_drake.physics import ObjectPhysics, set_object_physics
 from rhp_drake.resources import make_package_map
 from rhp_drake.station.object_poses import ObjectPoses
 from rhp_drake.station.ports import JOINT_NAMES, NUM_JOINTS
@@ -140,8 +137,6 @@ def MakeSimulatedStation(
     for i, name in enumerate(config.objects):
         color = _OBSTACLE_COLOR if i else _TARGET_COLOR
         _paint(plant, scene_graph, name, color)
-    for name in ("hand", *config.objects):
-        _set_friction(plant, scene_graph, name, NOMINAL_FRICTION)
     plant.Finalize()
 
     servo = builder.AddNamedSystem(
@@ -242,24 +237,6 @@ def _only_body(plant: MultibodyPlant, name: str) -> BodyIndex:
     if len(bodies) != 1 or not plant.get_body(bodies[0]).is_floating_base_body():
         raise InputError(f"the object '{name}' must be one free body.")
     return bodies[0]
-
-
-def _set_friction(
-    plant: MultibodyPlant, scene_graph: SceneGraph, name: str, coefficient: float
-) -> None:
-    """Gives all of a model's collision geometry one coefficient of friction.
-
-    Models that do not state one get 1 from Drake's parser.
-    """
-    inspector = scene_graph.model_inspector()
-    friction = CoulombFriction(coefficient, coefficient)
-    for body in plant.GetBodyIndices(plant.GetModelInstanceByName(name)):
-        for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(body)):
-            properties = ProximityProperties(inspector.GetProximityProperties(geometry))
-            properties.UpdateProperty("material", "coulomb_friction", friction)
-            scene_graph.AssignRole(
-                plant.get_source_id(), geometry, properties, RoleAssign.kReplace
-            )
 
 
 def _paint(
