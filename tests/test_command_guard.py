@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 import pytest
 
 from rhp_drake.errors import InputError
-from rhp_drake.station.position_servo import COMMAND_PERIOD
+from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.systems.command_guard import CommandGuard, CommandGuardConfig, Fault
 
 START = np.array([0.1, -1.2, 1.5, -1.9, -1.57, 0.3])

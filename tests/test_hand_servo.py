@@ -8,7 +8,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, DiscreteTimeDelay
 import pytest
 
-from rhp_drake.station.position_servo import COMMAND_PERIOD
+from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.ur5_kinematics import (
     PUSHING_HEIGHT,
     forward_kinematics,

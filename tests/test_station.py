@@ -15,8 +15,7 @@ from rhp_drake.physics import (
     nominal_physics,
 )
 from rhp_drake.random_streams import stream
-from rhp_drake.station.ports import STATION_PORTS, declared_ports
-from rhp_drake.station.position_servo import COMMAND_PERIOD
+from rhp_drake.station.ports import COMMAND_PERIOD, STATION_PORTS, declared_ports
 from rhp_drake.station.simulated_station import (
     MakeSimulatedStation,
     SetStationState,

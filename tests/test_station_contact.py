@@ -15,7 +15,7 @@ from pydrake.systems.analysis import Simulator
 import pytest
 
 from rhp_drake.physics import NOMINAL_FRICTION, nominal_physics
-from rhp_drake.station.position_servo import COMMAND_PERIOD
+from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.simulated_station import (
     MakeSimulatedStation,
     SetStationState,

@@ -16,6 +16,8 @@ JOINT_NAMES: Final = (
     "wrist_3_joint",
 )
 NUM_JOINTS: Final = len(JOINT_NAMES)
+# A UR5 of the CB3 series takes one command every 8 ms.
+COMMAND_PERIOD: Final = 0.008  # s
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from rhp_drake.station.ports import NUM_JOINTS
-
-# A CB3 controller takes one command every 8 ms.
-COMMAND_PERIOD = 0.008  # s
+from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 
 
 class PositionServo(LeafSystem):

@@ -8,8 +8,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
-from rhp_drake.station.ports import NUM_JOINTS
-from rhp_drake.station.position_servo import COMMAND_PERIOD
+from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 
 
 class Fault(enum.IntEnum):
@@ -31,7 +30,6 @@ class CommandGuardConfig:
         velocity_limit: Largest change of any joint's command, rad/s.  The arm itself
             stops at pi rad/s.
         tracking_limit: Largest distance of any measured joint from its command, rad.
-
     """
 
     # The elbow turns half as far as the others.

@@ -8,8 +8,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
-from rhp_drake.station.ports import NUM_JOINTS
-from rhp_drake.station.position_servo import COMMAND_PERIOD
+from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.station.ur5_kinematics import hand_pose, inverse_kinematics
 
 LINEAR_SPEED: Final = 0.12  # m/s, peak
@@ -30,7 +29,6 @@ class _Motion:
         start: Pose (x, y, theta), shape (3,).
         start_velocity: At the start, shape (3,), m/s and rad/s.
         target: Pose, shape (3,).
-
     """
 
     start: np.ndarray
@@ -173,7 +171,6 @@ def _next_step(
     Returns:
         The next time within the motion and the next command, or None if there is no
         way on.
-
     """
     time_step = COMMAND_PERIOD
     try:

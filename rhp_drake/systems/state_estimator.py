@@ -7,8 +7,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from rhp_drake.station.ports import NUM_JOINTS
-from rhp_drake.station.position_servo import COMMAND_PERIOD
+from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.station.ur5_kinematics import hand_pose
 
 REST_WINDOW: Final = 0.1  # s
@@ -49,7 +48,6 @@ class StateEstimator(LeafSystem):
 
     Args:
         num_objects: m, the target included.
-
     """
 
     def __init__(self, num_objects: int) -> None:
