@@ -2,5 +2,7 @@
 
 
 class InputError(ValueError):
-    """A user gave something that cannot work; the message is one clear sentence
-    that says what is wrong and where."""
+    """A user gave something that cannot work.
+
+    The message is one clear sentence that says what is wrong and where.
+    """

@@ -135,7 +135,7 @@ def objects_fallen(states: np.ndarray) -> np.ndarray:
     """Whether any object's centre is off the table, shape (...)."""
     positions = object_positions(states)
     off = (positions < TABLE_LOWER) | (positions > TABLE_UPPER)
-    return off.any(axis=(-1, -2))
+    return np.any(off, axis=(-1, -2))
 
 
 def hand_targets(states: np.ndarray, actions: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 import pytest
 
 from rhp_drake.errors import InputError
-from rhp_drake.planning.policy import Decision, PolicyFailure
+from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.random_streams import stream
 from rhp_drake.systems.receding_horizon_planner import (
     ARRIVAL_DISTANCE,
@@ -35,7 +35,7 @@ class Script:
     def decide(self, state, goals, generator, memory=None):
         index = 0 if memory is None else memory
         if index == len(self._actions):
-            raise PolicyFailure("the script is at its end.")
+            raise PolicyError("the script is at its end.")
         return Decision(self._actions[index], value=-1.0, memory=index + 1)
 
 

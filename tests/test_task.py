@@ -67,7 +67,7 @@ def test_overlaps_are_named():
     assert task.overlapping_bodies(state) == []
     state[6:8] = state[9:11] + 0.03
     assert task.overlapping_bodies(state) == ["object 1 and object 2"]
-    state[:2] = state[3:5] + [0.0, 0.05]
+    state[:2] = state[3:5] + np.array([0.0, 0.05])
     assert "hand and object 0" in task.overlapping_bodies(state)
 
 

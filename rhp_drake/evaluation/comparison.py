@@ -72,7 +72,7 @@ class Comparison:
 
 
 @lru_cache(maxsize=8)
-def _worker_tools(config_text: str) -> dict:  # noqa: ARG001
+def _worker_tools(config_text: str) -> dict:
     """What a process keeps from trial to trial, by the policy's description."""
     return {}
 
@@ -116,18 +116,24 @@ def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
     for policy in dict.fromkeys(trial.policy for trial, _ in results):
         episodes = [episode for trial, episode in results if trial.policy == policy]
         successes = [episode for episode in episodes if episode.succeeded]
-        seconds = np.concatenate([e.decision_seconds for e in episodes] or [[0.0]])
-        p50, p95 = 1e3 * np.percentile(seconds, [50, 95])
+        seconds = [s for episode in episodes for s in episode.decision_seconds]
+        # A policy that fails at once has made no decision.
+        p50, p95 = 1e3 * np.percentile(seconds or [np.nan], [50, 95])
         simulated = sum(e.simulated_seconds for e in episodes)
         factor = simulated / sum(e.world_seconds for e in episodes) if simulated else 0
         causes = [episode.outcome for episode in episodes if not episode.succeeded]
         table.add_row(
             policy,
             format_rate(len(successes), len(episodes)),
-            f"{np.mean([e.num_actions for e in successes] or [np.nan]):.1f}",
+            f"{_mean([e.num_actions for e in successes]):.1f}",
             f"{p50:.1f} / {p95:.1f} ms",
-            f"{np.mean([sum(e.decision_seconds) for e in successes] or [np.nan]):.2f} s",
+            f"{_mean([sum(e.decision_seconds) for e in successes]):.2f} s",
             f"{factor:.1f}" if simulated else "-",
             ", ".join(f"{causes.count(c)} {c}" for c in dict.fromkeys(causes)),
         )
     return table
+
+
+def _mean(values: Sequence[float]) -> float:
+    """The mean, nan of nothing."""
+    return float(np.mean(values)) if values else float("nan")

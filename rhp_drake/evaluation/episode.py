@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from rhp_drake.planning.policy import Policy, PolicyFailure
+from rhp_drake.planning.policy import Policy, PolicyError
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import MAX_ACTIONS, TaskInstance, goals_reached, objects_fallen
@@ -57,7 +57,7 @@ def run_episode(
             decision = policy.decide(
                 state, goals, stream(seed, index, "decision", k), memory
             )
-        except PolicyFailure:
+        except PolicyError:
             return Episode("policy failed", k, seconds)
         seconds.append(time.perf_counter() - begin)
         memory = decision.memory

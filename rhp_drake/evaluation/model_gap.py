@@ -9,7 +9,7 @@ from pydrake.systems.analysis import Simulator
 
 from rhp_drake.closed_loop import MakeClosedLoop, run_closed_loop
 from rhp_drake.physics import nominal_physics
-from rhp_drake.planning.policy import Decision, PolicyFailure
+from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION, stream
 from rhp_drake.scenario import Scenario
@@ -67,13 +67,13 @@ class _OneAction:
 
     def decide(
         self,
-        state: np.ndarray,  # noqa: ARG002
-        goals: np.ndarray,  # noqa: ARG002
-        generator: np.random.Generator,  # noqa: ARG002
+        state: np.ndarray,
+        goals: np.ndarray,
+        generator: np.random.Generator,
         memory: Any = None,
     ) -> Decision:
         if memory is not None:
-            raise PolicyFailure("the action is done.")
+            raise PolicyError("the action is done.")
         return Decision(self.action, float("nan"), memory="done")
 
 
@@ -85,8 +85,8 @@ def _sample_push(
         instance = sample_instance(generator, push_model.num_objects)
         state = instance.initial_state.copy()
         state[:2] = state[3:5] + generator.uniform(-_REACH, _REACH, size=2)
-        action = Action(generator.integers(NUM_ACTIONS))
-        inside = (WORKSPACE_LOWER < state[:2]) & (state[:2] < WORKSPACE_UPPER)
+        action = Action(int(generator.integers(NUM_ACTIONS)))
+        inside = (state[:2] > WORKSPACE_LOWER) & (state[:2] < WORKSPACE_UPPER)
         if (
             not inside.all()
             or overlapping_bodies(state, 0.002)

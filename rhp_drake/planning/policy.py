@@ -6,8 +6,11 @@ from typing import Any, Protocol
 import numpy as np
 
 
-class PolicyFailure(Exception):
+class PolicyError(Exception):
     """The policy has no action to offer; the message says why."""
+
+
+PolicyFailure = PolicyError  # Its name in `kinodynamic_rrt`, for now.
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,6 @@ class Policy(Protocol):
                 None at the first.
 
         Raises:
-            PolicyFailure: If it has no action to offer.
+            PolicyError: If it has no action to offer.
         """
         ...

@@ -5,7 +5,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from rhp_drake.planning.policy import Decision, PolicyFailure
+from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     MAX_ACTIONS,
@@ -90,7 +90,7 @@ class RecedingHorizon:
         """The first action of the best roll-out; see `policy.Policy`."""
         q = masked_values(self.value_function, state[None], goals)
         if not np.isfinite(q).any():
-            raise PolicyFailure("no action keeps the hand in the workspace.")
+            raise PolicyError("no action keeps the hand in the workspace.")
         if self.horizon == 0:
             return Decision(int(q[0].argmax()), float(q[0].max()))
 

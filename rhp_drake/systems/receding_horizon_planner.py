@@ -10,7 +10,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from rhp_drake.errors import InputError
-from rhp_drake.planning.policy import Decision, Policy, PolicyFailure
+from rhp_drake.planning.policy import Decision, Policy, PolicyError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
     MAX_ACTIONS,
@@ -54,7 +54,6 @@ class DecisionRecord:
         decision: What it decided.
         milliseconds: How long it computed, by the clock on the wall.
         target_distance: From the target object to its goal, m.
-
     """
 
     index: int
@@ -85,7 +84,6 @@ class _Episode:
         sent_time: When, s.
         num_actions: How many actions there were.
         record: The latest decision, None before the first.
-
     """
 
     hand_target: np.ndarray
@@ -137,7 +135,6 @@ class RecedingHorizonPlanner(LeafSystem):
     Args:
         policy: Chooses the actions.
         num_objects: m, the target included.
-
     """
 
     def __init__(self, policy: Policy, num_objects: int) -> None:
@@ -190,7 +187,6 @@ class RecedingHorizonPlanner(LeafSystem):
 
         Raises:
             InputError: If the seed is negative or above `MAX_SEED`.
-
         """
         if not 0 <= seed <= MAX_SEED:
             raise InputError(f"seed {seed} is not in 0 to {MAX_SEED}.")
@@ -267,7 +263,7 @@ class RecedingHorizonPlanner(LeafSystem):
             decision = self._policy.decide(
                 state, goals, stream(seed, "decision", index), memory
             )
-        except PolicyFailure as failure:
+        except PolicyError as failure:
             return episode.ended(Status.POLICY_FAILED, str(failure))
         milliseconds = 1000 * (time.perf_counter() - start)
         if not allowed_actions(state)[decision.action]:

@@ -4,6 +4,7 @@ A file is in the safetensors format, which cannot execute code; its metadata say
 what the weights are for and where they come from.
 """
 
+from itertools import pairwise
 import json
 from pathlib import Path
 from typing import Any, Final
@@ -37,7 +38,7 @@ class QNetwork(nn.Module):
         self.provenance: dict[str, Any] = {}
         widths = [num_features(num_objects), *HIDDEN_LAYERS]
         layers: list[nn.Module] = []
-        for inputs, outputs in zip(widths[:-1], widths[1:], strict=True):
+        for inputs, outputs in pairwise(widths):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
         layers.append(nn.Linear(widths[-1], NUM_ACTIONS))
         self.layers = nn.Sequential(*layers)
@@ -77,7 +78,9 @@ def load_q_network(path: Path, num_objects: int) -> QNetwork:
     except FileNotFoundError as error:
         raise InputError(f"{path}: there is no such file of weights.") from error
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: not a readable file of weights ({error}).") from error
+        raise InputError(
+            f"{path}: not a readable file of weights ({error})."
+        ) from error
     if metadata.get("format") != _FORMAT:
         raise InputError(f"{path}: not the weights of a Q-network of this version.")
     if metadata.get("num_objects") != str(num_objects):
