@@ -15,9 +15,10 @@ import numpy as np
 
 from rhp_drake import task, typed_yaml
 from rhp_drake.errors import InputError
+from rhp_drake.frozen_instances import NUM_OBJECTS, SET_SIZE, SETS, load_instances
 from rhp_drake.physics import UNCERTAINTY_LEVELS
 from rhp_drake.planning.policy_config import PolicyConfig, RecedingHorizonConfig
-from rhp_drake.random_streams import EVALUATION, TRAINING, VALIDATION, stream
+from rhp_drake.random_streams import TRAINING, VALIDATION, stream
 from rhp_drake.resources import scenarios_path
 from rhp_drake.station.simulated_station import StationConfig
 from rhp_drake.systems.command_guard import CommandGuardConfig
@@ -59,7 +60,8 @@ class SampledInstance:
     """A task drawn at random, as section VII-A of the paper does.
 
     Attributes:
-        set: "training", "validation" or "evaluation".  They never share a task.
+        set: "training", which has no end, or one of the frozen sets of 500 tasks,
+            "validation" and "evaluation".  They never share a task.
         index: Which task of the set; null for the scenario's seed.
     """
 
@@ -184,11 +186,17 @@ def make_task_instance(scenario: Scenario) -> task.TaskInstance:
     config = scenario.task
     if isinstance(config, Layout):
         return _layout_instance(config, num_objects)
-    sets = (TRAINING, VALIDATION, EVALUATION)
+    sets = (TRAINING, *SETS)
     _check(config.set in sets, "task.set", config.set, f"one of {', '.join(sets)}")
     index = scenario.seed if config.index is None else config.index
     _check(index >= 0, "task.index", index, "at least 0")
-    return task.sample_instance(stream(0, config.set, index), num_objects)
+    if config.set == TRAINING:
+        return task.sample_instance(stream(0, TRAINING, index), num_objects)
+    wanted = f"below {SET_SIZE}, the size of the {config.set} set"
+    _check(index < SET_SIZE, "task.index (or seed)", index, wanted)
+    wanted = f"training or a !Layout unless there are {NUM_OBJECTS} objects"
+    _check(num_objects == NUM_OBJECTS, "task.set", config.set, wanted)
+    return load_instances(config.set)[index]
 
 
 def _layout_instance(layout: Layout, num_objects: int) -> task.TaskInstance:

@@ -5,7 +5,7 @@ import pytest
 
 from rhp_drake import cli, typed_yaml
 from rhp_drake.errors import InputError
-from rhp_drake.evaluation.instances import SETS, load_instances
+from rhp_drake.frozen_instances import SETS, load_instances
 from rhp_drake.planning.policy_config import GreedyConfig, RecedingHorizonConfig
 from rhp_drake.resources import scenarios_path
 from rhp_drake.scenario import (
@@ -140,6 +140,11 @@ def test_expanded_scenario_loads_again(tmp_path):
         ("a: {world_physics: extreme}", ": a: world_physics: must be one of none, lo"),
         ("a: {task: {set: test}}", ": a: task.set: must be one of training, validat"),
         ("a: {task: {index: -1}}", ": a: task.index: must be at least 0, not -1."),
+        ("a: {seed: 500}", ": a: task.index (or seed): must be below 500, the size of"),
+        (
+            "a: {station: {objects: [target]}}",
+            ": a: task.set: must be training or a !Layout unless there are 3 objects",
+        ),
         ("a: {visualization: {camera: [1]}}", ": a: visualization.camera: must be t"),
         ("a: [", ", line 1: not valid YAML: "),
         ("", ": expected a mapping of names to values."),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rhp_drake import task
-from rhp_drake.evaluation.instances import SET_SIZE, load_instances
+from rhp_drake.frozen_instances import SET_SIZE, load_instances
 from rhp_drake.random_streams import EVALUATION, TRAINING, VALIDATION, stream
 from rhp_drake.task import Action
 

@@ -10,8 +10,8 @@ from rich.table import Table
 
 from rhp_drake.errors import InputError
 from rhp_drake.evaluation.episode import Episode, run_episode
-from rhp_drake.evaluation.instances import load_instances
 from rhp_drake.evaluation.statistics import format_rate
+from rhp_drake.frozen_instances import load_instances
 from rhp_drake.planning.policy_config import MakePolicy, PolicyConfig
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.workers import run_over

@@ -15,10 +15,11 @@ from rhp_drake.files import write_atomically
 from rhp_drake.random_streams import EVALUATION, VALIDATION, stream
 from rhp_drake.task import TaskInstance, sample_instance
 
-SETS: Final = (EVALUATION, VALIDATION)
+SETS: Final = (VALIDATION, EVALUATION)
 SET_SIZE: Final = 500
+NUM_OBJECTS: Final = 3
 _SEED: Final = 0
-_FOLDER: Final = Path(__file__).resolve().parent.parent / "data"
+_FOLDER: Final = Path(__file__).resolve().parent / "data"
 
 
 def load_instances(name: str) -> list[TaskInstance]:
@@ -43,7 +44,9 @@ def load_instances(name: str) -> list[TaskInstance]:
 
 def freeze_instances(name: str, folder: Path = _FOLDER) -> None:
     """Draws a set and stores it; how the files in the repository were made."""
-    instances = [sample_instance(stream(_SEED, name, i)) for i in range(SET_SIZE)]
+    instances = [
+        sample_instance(stream(_SEED, name, i), NUM_OBJECTS) for i in range(SET_SIZE)
+    ]
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
