@@ -98,16 +98,15 @@ def fit(
     from rich.console import Console
 
     from rhp_drake.learning.demonstrations import load_demonstrations
-    from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, Transitions
+    from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import load_q_network
 
     console = Console()
     data = load_demonstrations(demonstrations, plans)
-    transitions = Transitions.from_demonstrations(data)
     network = load_q_network(start, data.goals.shape[1])
     config = FittedQConfig(num_steps=steps)
-    learner = FittedQ(network, config, stream(seed, "fitted_q"))
+    learner = FittedQ(network, data, config, stream(seed, "fitted_q"))
     checkpoint = out.with_name(out.name + ".checkpoint")
     if checkpoint.exists():
         learner.resume(checkpoint)
@@ -115,7 +114,7 @@ def fit(
     with _progress(console) as progress:
         bar = progress.add_task("Steps", total=steps, completed=learner.num_steps)
         while learner.num_steps < steps:
-            learner.step(transitions)
+            learner.step()
             if learner.num_steps % 100 == 0:
                 progress.update(
                     bar,

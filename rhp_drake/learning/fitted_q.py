@@ -1,10 +1,12 @@
-"""Fitted Q: double Q-learning on simulated transitions, with goals relabelled.
+"""Fitted Q: double Q-learning on simulated transitions, with goals in hindsight.
 
 A transition of the push model is true whatever the goals are.  So every action that a
-search or a roll-out ever simulated teaches the value of any task in which its state
-may occur: each sample draws new goals, by hindsight near where things went.  The
-update is Eq. 4 of the paper with a target network and double Q-learning (van Hasselt
-et al. 2016).
+search ever simulated teaches the value of any task in which its state may occur.  The
+goals of a sample are those of its task, or, in hindsight (Andrychowicz et al. 2017),
+places where things went some actions later in the same search; the search then shows
+that the goal can be reached in so many actions, a lower bound of the value (He et al.
+2017).  Else the update is Eq. 4 of the paper, with a target network and double
+Q-learning (van Hasselt et al. 2016).
 """
 
 from dataclasses import dataclass
@@ -27,17 +29,17 @@ from rhp_drake.task import (
     REWARD,
     allowed_actions,
     goals_reached,
+    object_positions,
     objects_fallen,
 )
 from rhp_drake.value.q_network import QNetwork
 
-# How often a sample's goal for the target is: where the target went, the task's own.
-# Else it is a place between the two.
-_GOAL_AT_NEXT: Final = 0.2
-_GOAL_OF_TASK: Final = 0.6
-# How often an obstacle keeps the region of its task, rather than one drawn around
-# where it stands.
-_OBSTACLE_OF_TASK: Final = 0.6
+# How many of a batch's samples get goals in hindsight.
+_HINDSIGHT: Final = 0.5
+# Hindsight looks at most this many actions ahead.
+_FORESIGHT: Final = 20
+# m: a target that moved less teaches nothing about pushing it.
+_LEAST_MOTION: Final = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,37 +57,29 @@ class FittedQConfig:
 
     discount: float = 1.0
     l2: float = 1e-6
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     batch_size: int = 1024
     num_steps: int = 30_000
     target_rate: float = 0.005
 
 
 @dataclass(frozen=True)
-class Transitions:
-    """T transitions, each with the goals of the task it was simulated for.
+class Samples:
+    """N transitions with the goals they are looked at for.
 
     Attributes:
-        states: Shape (T, 3 + 3 m).
-        actions: Shape (T,).
-        next_states: Shape (T, 3 + 3 m).
-        goals: Shape (T, m, 2).
+        states: Shape (N, 3 + 3 m).
+        actions: Shape (N,).
+        next_states: Shape (N, 3 + 3 m).
+        goals: Shape (N, m, 2).
+        least_returns: What the return is known to reach at least, shape (N,).
     """
 
     states: np.ndarray
     actions: np.ndarray
     next_states: np.ndarray
     goals: np.ndarray
-
-    @classmethod
-    def from_demonstrations(cls, demonstrations: Demonstrations) -> "Transitions":
-        """All that was simulated for the demonstrations."""
-        return cls(
-            demonstrations.search_states,
-            demonstrations.search_actions,
-            demonstrations.search_next_states,
-            demonstrations.goals[demonstrations.search_tasks].astype(np.float32),
-        )
+    least_returns: np.ndarray
 
 
 def _in_disc(centres: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -96,28 +90,43 @@ def _in_disc(centres: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     return centres + np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
 
 
-def relabel(batch: Transitions, generator: np.random.Generator) -> np.ndarray:
-    """New goals (N, m, 2) for a batch of transitions."""
-    goals = batch.goals.copy()
-    next_objects = batch.next_states[:, 3:].reshape(len(goals), -1, 3)[..., :2]
-    objects = batch.states[:, 3:].reshape(len(goals), -1, 3)[..., :2]
-    choice = generator.random(len(goals))
-    hindsight = _in_disc(next_objects[:, 0], generator)
-    fraction = generator.random((len(goals), 1))
-    between = hindsight + fraction * (goals[:, 0] - hindsight)
-    goals[:, 0] = np.select(
-        [
-            (choice < _GOAL_AT_NEXT)[:, None],
-            (choice < _GOAL_AT_NEXT + _GOAL_OF_TASK)[:, None],
-        ],
-        [hindsight, goals[:, 0]],
-        between,
+def sample(
+    data: Demonstrations, num_samples: int, generator: np.random.Generator
+) -> Samples:
+    """Draws transitions and their goals."""
+    num_hindsight = int(_HINDSIGHT * num_samples)
+    rows = generator.integers(len(data.search_actions), size=num_samples)
+    goals = data.goals[data.search_tasks[rows]]
+    least = np.full(num_samples, -np.inf)
+
+    # The first of them in hindsight: `ends` is where the goals come from, `rows` a
+    # transition on the way there, `num_actions` of them before the end.
+    ends = rows[:num_hindsight].copy()
+    num_actions = np.ones(num_hindsight, dtype=int)
+    wanted = generator.integers(1, _FORESIGHT + 1, size=num_hindsight)
+    for _ in range(_FORESIGHT - 1):
+        origins = data.search_origins[rows[:num_hindsight]]
+        back = (num_actions < wanted) & (origins >= 0)
+        rows[:num_hindsight][back] = origins[back]
+        num_actions[back] += 1
+    start = object_positions(data.search_states[rows[:num_hindsight]])
+    end = object_positions(data.search_next_states[ends])
+    moved = np.linalg.norm(end[:, 0] - start[:, 0], axis=1) > _LEAST_MOTION
+    found = _in_disc(end, generator)
+    # An obstacle still in its task's region needs no other one.
+    of_task = goals[:num_hindsight]
+    kept = np.linalg.norm(end - of_task, axis=-1) <= GOAL_RADIUS
+    kept[:, 0] = False
+    found = np.where(kept[..., None], of_task, found)
+    goals[:num_hindsight][moved] = found[moved]
+    least[:num_hindsight][moved] = REWARD * num_actions[moved]
+    return Samples(
+        data.search_states[rows],
+        data.search_actions[rows],
+        data.search_next_states[rows],
+        goals,
+        least,
     )
-    keep = generator.random(goals[:, 1:].shape[:2]) < _OBSTACLE_OF_TASK
-    goals[:, 1:] = np.where(
-        keep[..., None], goals[:, 1:], _in_disc(objects[:, 1:], generator)
-    )
-    return goals
 
 
 def double_q_targets(
@@ -154,6 +163,7 @@ class FittedQ:
 
     Args:
         network: Its weights are the start.
+        data: What was simulated.
         config: How.
         generator: Draws the batches, their goals and symmetries.
 
@@ -163,11 +173,16 @@ class FittedQ:
     """
 
     def __init__(
-        self, network: QNetwork, config: FittedQConfig, generator: np.random.Generator
+        self,
+        network: QNetwork,
+        data: Demonstrations,
+        config: FittedQConfig,
+        generator: np.random.Generator,
     ) -> None:
         self.num_steps = 0
         self.mean_loss = 0.0
         self._network = network
+        self._data = data
         self._config = config
         self._generator = generator
         self._target = QNetwork(network.num_objects)
@@ -179,32 +194,35 @@ class FittedQ:
             self._optimizer, config.num_steps
         )
 
-    def step(self, transitions: Transitions) -> None:
+    def step(self) -> None:
         """One gradient step on a random batch."""
         config, network = self._config, self._network
-        rows = self._generator.integers(len(transitions.actions), size=config.batch_size)
-        batch = Transitions(*(array[rows] for array in vars(transitions).values()))
-        goals = relabel(batch, self._generator)
-        reached = torch.from_numpy(goals_reached(batch.next_states, goals))
+        batch = sample(self._data, config.batch_size, self._generator)
+        reached = torch.from_numpy(goals_reached(batch.next_states, batch.goals))
         fallen = torch.from_numpy(objects_fallen(batch.next_states))
         allowed = torch.from_numpy(allowed_actions(batch.next_states))
+        # An episode ends at the goal: nobody asks for values there.
+        asked = torch.from_numpy(~goals_reached(batch.states, batch.goals))
 
-        symmetry = Symmetry(len(rows), network.num_objects, self._generator)
-        goals_seen = symmetry.goals(torch.from_numpy(goals).float())
+        symmetry = Symmetry(len(asked), network.num_objects, self._generator)
+        goals = symmetry.goals(torch.from_numpy(batch.goals).float())
         states = symmetry.states(torch.from_numpy(batch.states))
         next_states = symmetry.states(torch.from_numpy(batch.next_states))
         actions = symmetry.actions(torch.from_numpy(batch.actions).long())
         with torch.no_grad():
             targets = double_q_targets(
-                network(next_states, goals_seen),
-                self._target(next_states, goals_seen),
+                network(next_states, goals),
+                self._target(next_states, goals),
                 symmetry.action_masks(allowed),
                 reached,
                 fallen,
                 config.discount,
             )
-        q = network(states, goals_seen).gather(1, actions[:, None])[:, 0]
-        loss = torch.nn.functional.smooth_l1_loss(q, targets)
+            least = torch.from_numpy(batch.least_returns).float()
+            targets = torch.maximum(targets, least)
+        q = network(states, goals).gather(1, actions[:, None])[:, 0]
+        losses = torch.nn.functional.smooth_l1_loss(q, targets, reduction="none")
+        loss = (losses * asked).mean()
         self._optimizer.zero_grad()
         loss.backward()
         self._optimizer.step()

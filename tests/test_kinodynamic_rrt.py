@@ -1,0 +1,86 @@
+"""The kinodynamic RRT: its plans are true, its searches repeatable."""
+
+import numpy as np
+import pytest
+
+from rhp_drake.planning.kinodynamic_rrt import OpenLoop, plan
+from rhp_drake.planning.policy import PolicyError
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.random_streams import TRAINING, stream
+from rhp_drake.task import allowed_actions, goals_reached, sample_instance
+
+
+@pytest.fixture(scope="module")
+def push_model():
+    return PushModel(3)
+
+
+def search(push_model, index, **limits):
+    instance = sample_instance(stream(5, TRAINING, index))
+    found = plan(
+        push_model,
+        instance.initial_state,
+        instance.goals,
+        stream(5, "plan", index),
+        **limits,
+    )
+    return instance, found
+
+
+def test_plans_lead_to_the_goal_when_replayed(push_model):
+    solved = 0
+    for index in range(12):
+        instance, found = search(push_model, index, max_transitions=2000)
+        np.testing.assert_array_equal(found.states[0], instance.initial_state)
+        if found.actions is None:
+            assert len(found.states) == 1
+            continue
+        solved += 1
+        state = instance.initial_state
+        for action, expected in zip(found.actions, found.states[1:], strict=True):
+            assert not goals_reached(state, instance.goals)
+            assert allowed_actions(state)[action]
+            state = push_model.step(state[None], np.array([action]))[0]
+            np.testing.assert_array_equal(state, expected)
+        assert goals_reached(state, instance.goals)
+    assert solved >= 9
+
+
+def test_searches_are_repeatable_and_their_transitions_true(push_model):
+    instance, found = search(push_model, 3, max_transitions=600)
+    _, again = search(push_model, 3, max_transitions=600)
+    for name, array in vars(found.search).items():
+        np.testing.assert_array_equal(array, getattr(again.search, name), err_msg=name)
+    s = found.search
+    np.testing.assert_array_equal(push_model.step(s.states, s.actions), s.next_states)
+    for state, origin in zip(s.states, s.origins, strict=True):
+        before = instance.initial_state if origin < 0 else s.next_states[origin]
+        np.testing.assert_array_equal(state, before)
+
+
+def test_limit_of_transitions(push_model):
+    for index in range(6):
+        _, found = search(push_model, index, max_transitions=30)
+        assert len(found.search.actions) < 30 + 6
+
+
+def test_open_loop_executes_its_plan_and_no_more(push_model):
+    instance, found = search(push_model, 0)
+    policy = OpenLoop(push_model)
+    memory, actions = None, []
+    with pytest.raises(PolicyError, match="plan has ended"):
+        while True:
+            decision = policy.decide(
+                instance.initial_state, instance.goals, stream(5, "plan", 0), memory
+            )
+            actions.append(decision.action)
+            memory = decision.memory
+    np.testing.assert_array_equal(actions, found.actions)
+
+
+def test_no_plan_in_no_time(push_model):
+    instance = sample_instance(stream(5, TRAINING, 0))
+    with pytest.raises(PolicyError, match="no plan"):
+        OpenLoop(push_model, time_limit=0.0).decide(
+            instance.initial_state, instance.goals, stream(0)
+        )

@@ -1,0 +1,190 @@
+"""Demonstrations, imitation and fitted Q."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rhp_drake.errors import InputError
+from rhp_drake.learning.augmentation import Symmetry
+from rhp_drake.learning.demonstrations import (
+    PLANS_PER_SHARD,
+    load_demonstrations,
+    make_demonstrations,
+)
+from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, double_q_targets, sample
+from rhp_drake.learning.imitation import (
+    ImitationConfig,
+    imitate,
+    imitation_targets,
+    return_of,
+)
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.random_streams import stream
+from rhp_drake.task import (
+    Action,
+    goals_reached,
+    hand_targets,
+    object_positions,
+)
+from rhp_drake.value.q_network import QNetwork
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("demonstrations")
+    assert list(make_demonstrations(path, PLANS_PER_SHARD, 11, 3, 1)) == [
+        0,
+        PLANS_PER_SHARD,
+    ]
+    return path
+
+
+@pytest.fixture(scope="module")
+def data(folder):
+    return load_demonstrations(folder)
+
+
+def test_interrupted_work_goes_on(folder):
+    shard = folder / "plans_00000.npz"
+    before = shard.stat().st_mtime_ns
+    (folder / "plans_00001.npz.123.tmp").write_bytes(b"half a shard")
+    assert list(make_demonstrations(folder, PLANS_PER_SHARD, 11, 3, 1)) == [
+        PLANS_PER_SHARD
+    ]
+    assert shard.stat().st_mtime_ns == before
+    assert len(load_demonstrations(folder).goals) == PLANS_PER_SHARD
+
+
+def test_bad_demonstrations_are_named(folder, tmp_path):
+    with pytest.raises(InputError, match="holds no demonstrations"):
+        load_demonstrations(tmp_path)
+    with pytest.raises(InputError, match="25 plans, not 100"):
+        load_demonstrations(folder, 100)
+    (tmp_path / "plans_00000.npz").write_bytes(b"not an archive")
+    with pytest.raises(InputError, match="plans_00000.npz"):
+        load_demonstrations(tmp_path)
+
+
+def test_demonstrations_hold_plans_that_end_at_the_goal(data):
+    last = data.plan_actions_left == 1
+    assert last.sum() == data.solved.sum()
+    push_model = PushModel(3)
+    ends = push_model.step(
+        data.plan_states[last].astype(float), data.plan_actions[last].astype(int)
+    )
+    # Stored in single precision: an end on a region's border may be rounded out.
+    reached = goals_reached(ends, data.goals[data.plan_tasks[last]])
+    assert reached.mean() > 0.9
+
+
+def test_eq_2():
+    left = torch.tensor([1.0, 3.0])
+    torch.testing.assert_close(return_of(left, 1.0), torch.tensor([-1.0, -3.0]))
+    torch.testing.assert_close(return_of(left, 0.5), torch.tensor([-1.0, -1.75]))
+
+
+def test_eq_3_grounds_only_what_looks_better_than_the_plan():
+    q = torch.tensor([[-5.0, -2.0, -3.0, -9.0, -3.1, 0.0]])
+    targets = imitation_targets(
+        q, torch.tensor([0]), torch.tensor([3.0]), margin=4, discount=1.0
+    )
+    # The plan's action 0 is worth -3; at or above that, -7; else as it is.
+    expected = torch.tensor([[-3.0, -7.0, -7.0, -9.0, -3.1, -7.0]])
+    torch.testing.assert_close(targets, expected)
+
+
+def test_imitation_learns_the_plans(data):
+    torch.manual_seed(0)
+    network = QNetwork(3)
+    losses = list(imitate(network, data, ImitationConfig(num_epochs=60), stream(0)))
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_double_q_targets_by_hand():
+    q_next = torch.tensor([[0.0, 5, 1, 1, 1, 1]] * 4)
+    target_q_next = torch.tensor([[-3.0, -7, -100, 0, 0, 0]] * 4)
+    allowed = torch.ones(4, 6, dtype=torch.bool)
+    allowed[1, 1] = False  # Then action 2 is the best, worth less than all is.
+    targets = double_q_targets(
+        q_next,
+        target_q_next,
+        allowed,
+        reached=torch.tensor([False, False, True, False]),
+        fallen=torch.tensor([False, False, False, True]),
+        discount=1.0,
+    )
+    torch.testing.assert_close(targets, torch.tensor([-8.0, -41.0, -1.0, -41.0]))
+
+
+def test_hindsight_goals_are_reached_in_time(data):
+    """Following the search from a sample to its end meets the goals it was given."""
+    samples = sample(data, 4000, stream(1))
+    known = np.isfinite(samples.least_returns)
+    assert known.mean() > 0.05
+    # One action is enough where the least return says so.
+    one = known & (samples.least_returns == -1.0)
+    assert one.sum() > 10
+    assert goals_reached(samples.next_states[one], samples.goals[one]).all()
+    push_model = PushModel(3)
+    after = push_model.step(
+        samples.states[:200].astype(float), samples.actions[:200].astype(int)
+    )
+    difference = object_positions(after) - object_positions(samples.next_states[:200])
+    assert np.median(np.abs(difference)) < 1e-5
+
+
+def test_symmetries_are_those_of_the_task(data):
+    rows = np.arange(200)
+    states = data.search_states[rows].astype(float)
+    actions = data.search_actions[rows].astype(int)
+    goals = data.goals[data.search_tasks[rows]]
+    symmetry = Symmetry(len(rows), 3, stream(2))
+    seen = symmetry.states(torch.from_numpy(states)).numpy()
+    seen_actions = symmetry.actions(torch.from_numpy(actions)).numpy()
+    seen_goals = symmetry.goals(torch.from_numpy(goals)).numpy()
+    assert set(np.unique(seen_actions)) <= set(Action)
+    # The hand goes where the mirror image of the hand goes...
+    moved = states.copy()
+    moved[:, :3] = hand_targets(states, actions)
+    expected = symmetry.states(torch.from_numpy(moved)).numpy()[:, :3]
+    np.testing.assert_allclose(hand_targets(seen, seen_actions), expected, atol=1e-9)
+    # ...and objects keep their distances to their goals, the target its place.
+    ways = np.linalg.norm(object_positions(states) - goals, axis=-1)
+    seen_ways = np.linalg.norm(object_positions(seen) - seen_goals, axis=-1)
+    np.testing.assert_allclose(seen_ways[:, 0], ways[:, 0])
+    np.testing.assert_allclose(np.sort(seen_ways[:, 1:]), np.sort(ways[:, 1:]))
+
+
+def test_fitting_goes_on_from_a_checkpoint_as_if_never_stopped(data, tmp_path):
+    config = FittedQConfig(num_steps=8, batch_size=64)
+
+    def learner():
+        torch.manual_seed(0)
+        network = QNetwork(3)
+        return network, FittedQ(network, data, config, stream(3))
+
+    network, straight = learner()
+    for _ in range(8):
+        straight.step()
+    _, stopped = learner()
+    for _ in range(3):
+        stopped.step()
+    stopped.save(tmp_path / "checkpoint")
+    resumed_network, resumed = learner()
+    resumed.resume(tmp_path / "checkpoint")
+    for _ in range(5):
+        resumed.step()
+    for ours, theirs in zip(
+        network.parameters(), resumed_network.parameters(), strict=True
+    ):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+    assert resumed.mean_loss == straight.mean_loss
+
+    (tmp_path / "corrupt").write_bytes(b"no checkpoint")
+    with pytest.raises(InputError, match="corrupt"):
+        resumed.resume(tmp_path / "corrupt")
+    other = FittedQ(network, data, replace(config, discount=0.9), stream(3))
+    with pytest.raises(InputError, match="another configuration"):
+        other.resume(tmp_path / "checkpoint")
