@@ -27,8 +27,8 @@ def evaluate(
     temperature: Annotated[
         float | None, typer.Option(help="tau of RHP's soft-max, in actions.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the policies' random draws.")] = 0,
-    workers: Annotated[int, typer.Option(help="Processes.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Of the random draws.")] = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
     out: Annotated[
         Path | None, typer.Option(help="Write every episode to this JSON file.")
     ] = None,

@@ -106,12 +106,18 @@ def run_comparison(
 
 
 def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
-    """A table of success, causes of failure, and cost, a row a policy."""
+    """A table of success, causes of failure, and cost, a row a policy.
+
+    Actions and computation are means over the runs that succeeded; the last number is
+    simulated time over the world's own computation.
+    """
     table = Table(title=title)
-    for heading in ("policy", "success % (95 % Wilson)", "actions", "decision p50/p95"):
-        table.add_column(heading, justify="left" if heading == "policy" else "right")
-    table.add_column("computation a run")
-    table.add_column("real-time factor of the world")
+    table.add_column("policy", no_wrap=True)
+    table.add_column("success %\n(95 % Wilson)", justify="right", no_wrap=True)
+    table.add_column("actions\na run", justify="right", no_wrap=True)
+    table.add_column("decision, ms\np50 / p95", justify="right", no_wrap=True)
+    table.add_column("computing\na run, s", justify="right", no_wrap=True)
+    table.add_column("world, x\nreal time", justify="right", no_wrap=True)
     table.add_column("failures")
     for policy in dict.fromkeys(trial.policy for trial, _ in results):
         episodes = [episode for trial, episode in results if trial.policy == policy]
@@ -126,8 +132,8 @@ def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
             policy,
             format_rate(len(successes), len(episodes)),
             f"{_mean([e.num_actions for e in successes]):.1f}",
-            f"{p50:.1f} / {p95:.1f} ms",
-            f"{_mean([sum(e.decision_seconds) for e in successes]):.2f} s",
+            f"{p50:.1f} / {p95:.1f}",
+            f"{_mean([sum(e.decision_seconds) for e in successes]):.2f}",
             f"{factor:.1f}" if simulated else "-",
             ", ".join(f"{causes.count(c)} {c}" for c in dict.fromkeys(causes)),
         )

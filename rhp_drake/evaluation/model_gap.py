@@ -7,12 +7,13 @@ from typing import Any, Final
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from rhp_drake.closed_loop import MakeClosedLoop, run_closed_loop
+from rhp_drake.closed_loop import SUCCEEDED, MakeClosedLoop, run_closed_loop
 from rhp_drake.physics import nominal_physics
 from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION, stream
 from rhp_drake.scenario import Scenario
+from rhp_drake.systems.receding_horizon_planner import Status
 from rhp_drake.task import (
     NUM_ACTIONS,
     WORKSPACE_LOWER,
@@ -30,6 +31,8 @@ from rhp_drake.task import (
 _REACH: Final = 0.12
 # ...and the push model must see a box move at least this far.
 _LEAST_MOTION: Final = 0.005
+# How a run of one action ends: its policy has no other, or the task is done by chance.
+_DONE: Final = (Status.POLICY_FAILED.name.lower(), SUCCEEDED)
 
 
 @dataclass(frozen=True)
@@ -50,13 +53,24 @@ class Push:
 
     def displacement_errors(self) -> np.ndarray:
         """Distances between the worlds of the objects that either moved, m."""
-        start = object_positions(self.state)
-        ends = [
-            object_positions(self.push_model_state),
-            object_positions(self.station_state),
-        ]
-        moved = [np.linalg.norm(end - start, axis=1) > _LEAST_MOTION for end in ends]
-        return np.linalg.norm(ends[0] - ends[1], axis=1)[moved[0] | moved[1]]
+        return _distances(self.push_model_state, self.station_state)[self._moved()]
+
+    def displacements(self) -> np.ndarray:
+        """How far the same objects moved in the station, m."""
+        return _distances(self.state, self.station_state)[self._moved()]
+
+    def _moved(self) -> np.ndarray:
+        """Which objects moved in either world, booleans of shape (m,)."""
+        ends = (self.push_model_state, self.station_state)
+        return np.any(
+            [_distances(self.state, end) > _LEAST_MOTION for end in ends], axis=0
+        )
+
+
+def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of each object between its places in two states, shape (m,), m."""
+    offsets = object_positions(a) - object_positions(b)
+    return np.hypot(offsets[:, 0], offsets[:, 1])
 
 
 @dataclass(frozen=True)
@@ -120,7 +134,11 @@ def compare_pushes(num_pushes: int, seed: int, num_objects: int = 3) -> Iterator
             push_model, stream(seed, VALIDATION, "model_gap", index)
         )
         simulator = simulators[action]
-        run_closed_loop(simulator, instance, nominal_physics(num_objects), seed=0)
+        outcome = run_closed_loop(
+            simulator, instance, nominal_physics(num_objects), seed=0
+        )
+        if outcome.status not in _DONE:
+            raise RuntimeError(f"push {index}, {action.name}: {outcome.message}")
         state = simulator.get_system().GetOutputPort("state")
         yield Push(
             action,

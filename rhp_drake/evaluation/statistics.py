@@ -1,8 +1,10 @@
 """Statistics that every table here uses, and the machine they were made on."""
 
+from collections.abc import Sequence
 from importlib.metadata import version
 import platform
 
+import numpy as np
 from scipy.stats import binomtest
 
 
@@ -18,6 +20,24 @@ def format_rate(successes: int, trials: int) -> str:
     """A success rate in percent with its Wilson interval, e.g. ``88.0 (84.9-90.6)``."""
     low, high = wilson_interval(successes, trials)
     return f"{100 * successes / trials:.1f} ({100 * low:.1f}-{100 * high:.1f})"
+
+
+def bootstrap_interval(
+    groups: Sequence[np.ndarray], generator: np.random.Generator
+) -> tuple[float, float]:
+    """95 % bootstrap confidence interval of the mean of all values.
+
+    Args:
+        groups: The values, shape (n_i,), grouped by what they depend on in common;
+            whole groups are drawn.
+        generator: Where the draws come from.
+    """
+    sums = np.array([group.sum() for group in groups])
+    sizes = np.array([len(group) for group in groups])
+    draws = generator.integers(len(groups), size=(10_000, len(groups)))
+    means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def describe_machine(num_workers: int = 1) -> str:
