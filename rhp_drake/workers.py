@@ -11,7 +11,11 @@ Result = TypeVar("Result")
 
 
 def _use_one_thread() -> None:
-    """A worker is one thread: as many workers as cores then share nothing."""
+    """Makes this process compute in one thread.
+
+    As many workers as cores then share nothing, and sums come out the same whatever
+    the number of workers.
+    """
     os.environ["OMP_NUM_THREADS"] = "1"
     os.environ["DRAKE_NUM_THREADS"] = "1"
     import torch
@@ -27,9 +31,10 @@ def run_over(
     Args:
         function: A picklable function; what it draws must depend on its item alone.
         items: Picklable.
-        num_workers: Processes; 1 runs in this one.
+        num_workers: Processes, of one thread each; 1 runs in this one.
     """
     if num_workers <= 1:
+        _use_one_thread()
         for item in items:
             yield item, function(item)
         return
