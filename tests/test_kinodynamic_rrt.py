@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rhp_drake.planning.kinodynamic_rrt import OpenLoop, plan
+from rhp_drake.planning.kinodynamic_rrt import plan
+from rhp_drake.planning.open_loop import OpenLoop
 from rhp_drake.planning.policy import PolicyError
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import TRAINING, stream
@@ -68,14 +69,19 @@ def test_open_loop_executes_its_plan_and_no_more(push_model):
     instance, found = search(push_model, 0)
     policy = OpenLoop(push_model)
     memory, actions = None, []
-    with pytest.raises(PolicyError, match="plan has ended"):
-        while True:
-            decision = policy.decide(
-                instance.initial_state, instance.goals, stream(5, "plan", 0), memory
-            )
-            actions.append(decision.action)
-            memory = decision.memory
+
+    def decide():
+        return policy.decide(
+            instance.initial_state, instance.goals, stream(5, "plan", 0), memory
+        )
+
+    for _ in found.actions:
+        decision = decide()
+        actions.append(decision.action)
+        memory = decision.memory
     np.testing.assert_array_equal(actions, found.actions)
+    with pytest.raises(PolicyError, match="plan has ended"):
+        decide()
 
 
 def test_no_plan_in_no_time(push_model):

@@ -10,11 +10,10 @@ to the node's own target object.
 from dataclasses import dataclass
 import math
 import time
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from rhp_drake.planning.policy import Decision, PolicyFailure
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
@@ -174,9 +173,7 @@ class _Tree:
         self.transitions: list[int] = []
         self.add(state, -1, -1, -1)
 
-    def add(
-        self, state: np.ndarray, parent: int, action: int, transition: int
-    ) -> bool:
+    def add(self, state: np.ndarray, parent: int, action: int, transition: int) -> bool:
         """Adds a node, unless the tree has nearly the same state."""
         size = len(self._parents)
         key = state.copy()
@@ -288,37 +285,3 @@ def _grow(
         if added and goals_reached(child, tree.goals):
             return tree.plan_to_newest()
     return None
-
-
-class OpenLoop:
-    """The policy that plans once and executes the plan blindly: KDP of Table I.
-
-    Args:
-        push_model: What it plans in.
-        time_limit: Limit of computation, s.
-    """
-
-    def __init__(self, push_model: PushModel, time_limit: float = 120.0) -> None:
-        self._push_model = push_model
-        self._time_limit = time_limit
-
-    def decide(
-        self,
-        state: np.ndarray,
-        goals: np.ndarray,
-        generator: np.random.Generator,
-        memory: Any = None,
-    ) -> Decision:
-        """The plan's next action; see `policy.Policy`.  Plans at the first call."""
-        if memory is None:
-            found = plan(
-                self._push_model, state, goals, generator, time_limit=self._time_limit
-            )
-            if found.actions is None:
-                raise PolicyFailure(
-                    f"the planner found no plan in {found.seconds:.0f} s."
-                )
-            memory = tuple(found.actions)
-        if not memory:
-            raise PolicyFailure("the plan has ended and the goal is not reached.")
-        return Decision(int(memory[0]), -float(len(memory)), memory=memory[1:])

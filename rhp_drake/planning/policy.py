@@ -10,9 +10,6 @@ class PolicyError(Exception):
     """The policy has no action to offer; the message says why."""
 
 
-PolicyFailure = PolicyError  # Its name in `kinodynamic_rrt`, for now.
-
-
 @dataclass(frozen=True)
 class Decision:
     """What a policy decided in one state, and why.

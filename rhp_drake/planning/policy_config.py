@@ -90,7 +90,7 @@ def MakePolicy(config: PolicyConfig, num_objects: int) -> Policy:
         InputError: If a value is impossible, or the weights are missing, corrupt or
             for another m.
     """
-    from rhp_drake.planning.kinodynamic_rrt import OpenLoop
+    from rhp_drake.planning.open_loop import OpenLoop
     from rhp_drake.planning.receding_horizon import RecedingHorizon
     from rhp_drake.push_model.transition import PushModel
     from rhp_drake.resources import resolve

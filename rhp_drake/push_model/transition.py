@@ -93,9 +93,10 @@ def first_touches(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         ],
         axis=-1,
     )
-    touched = rectangles_overlap(
+    overlaps = rectangles_overlap(
         _SWEPT_RECTANGLES[actions][:, :, :, None], squares[:, None, None]
-    ).any(axis=(2, 3))
+    )
+    touched = np.any(overlaps, axis=(2, 3))
     return np.where(touched.any(axis=1), touched.argmax(axis=1), STEPS_PER_ACTION)
 
 
