@@ -63,7 +63,7 @@ def test_bad_demonstrations_are_named(folder, tmp_path):
     with pytest.raises(InputError, match="25 plans, not 100"):
         load_demonstrations(folder, 100)
     (tmp_path / "plans_00000.npz").write_bytes(b"not an archive")
-    with pytest.raises(InputError, match="plans_00000.npz"):
+    with pytest.raises(InputError, match=r"plans_00000\.npz"):
         load_demonstrations(tmp_path)
 
 
