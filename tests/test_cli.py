@@ -1,0 +1,85 @@
+import json
+import subprocess
+import sys
+
+import pytest
+
+from rhp_drake import cli
+from rhp_drake.value.q_network import QNetwork
+
+COMMANDS = ("run", "demos", "imitate", "fit", "evaluate", "bench")
+
+
+def rhp(monkeypatch, *arguments) -> int:
+    """Runs the command line in this process, and returns its exit status."""
+    monkeypatch.setattr("sys.argv", ["rhp", *arguments])
+    with pytest.raises(SystemExit) as info:
+        cli.main()
+    return info.value.code or 0
+
+
+def test_help_needs_neither_drake_nor_torch():
+    """They take seconds to import."""
+    code = (
+        "import sys\n"
+        "from rhp_drake import cli\n"
+        "sys.argv = ['rhp', '--help']\n"
+        "try:\n"
+        "    cli.main()\n"
+        "except SystemExit:\n"
+        "    print('imported', sorted({'pydrake', 'torch', 'scipy'} & {*sys.modules}))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert "imported []" in result.stdout
+    for command in COMMANDS:
+        assert f" {command} " in result.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_has_help(command, monkeypatch, capsys):
+    assert rhp(monkeypatch, command, "--help") == 0
+    assert f"rhp {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--policies", "kdp,best"], "--policies: 'best' is not one of kdp, gp, rhp3"),
+        (["--instances", "training"], "'training' is not a set of instances: "),
+        (["--count", "0"], "0 instances were asked for; the validation set has 500."),
+        (["--count", "501"], "501 instances were asked for; the validation set has"),
+        (["--world", "moon"], "'moon' is not a world: planar, station."),
+        (["--temperature", "0"], "policy.temperature is 0.0; it must be above 0."),
+        (["--weights", "missing", "--policies", "gp"], "missing: there is no such fi"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_evaluate_reports_bad_input(arguments, message, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert rhp(monkeypatch, "evaluate", "--workers", "1", *arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith(f"rhp: {message}")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("option", ["--seed=-1", "--workers=0", "--unknown"])
+def test_impossible_options(option, monkeypatch, capsys):
+    assert rhp(monkeypatch, "evaluate", option) == 2
+    assert option.split("=")[0] in capsys.readouterr().err
+
+
+def test_evaluate_writes_every_episode(monkeypatch, capsys, tmp_path):
+    weights, out = tmp_path / "weights.safetensors", tmp_path / "out.json"
+    QNetwork(3).save(weights)
+    options = ["--policies=gp,rhp33", "--count=2", "--workers=1", f"--out={out}"]
+    assert rhp(monkeypatch, "evaluate", *options, f"--weights={weights}") == 0
+    printed = capsys.readouterr().out
+    assert "first 2 instances of the validation set" in printed
+    episodes = json.loads(out.read_text())
+    trials = [(episode["policy"], episode["index"]) for episode in episodes]
+    assert trials == [("gp", 0), ("gp", 1), ("rhp33", 0), ("rhp33", 1)]
+    for episode in episodes:
+        assert len(episode["decision_seconds"]) == episode["num_actions"]
