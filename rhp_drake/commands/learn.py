@@ -81,6 +81,7 @@ def imitate(
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import QNetwork
 
+    torch.set_flush_denormal(True)
     console = Console()
     data = load_demonstrations(demonstrations)
     config = ImitationConfig(num_epochs=epochs)
@@ -108,12 +109,15 @@ def fit(
     beside the weights.
     """
     from rich.console import Console
+    import torch
 
     from rhp_drake.learning.demonstrations import load_demonstrations
     from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import load_q_network
 
+    # Gradients of dead units get so small that arithmetic takes five times as long.
+    torch.set_flush_denormal(True)
     console = Console()
     data = load_demonstrations(demonstrations)
     network = load_q_network(start, data.goals.shape[1])
