@@ -1,9 +1,11 @@
 """`rhp demos`, `rhp imitate` and `rhp fit`: from plans to a Q-network."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+
+_VALIDATION_TASKS: Final = 200
 
 # torch and Drake are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -178,6 +180,7 @@ def _save(
     """Writes the weights with where they come from."""
     from rhp_drake.run_record import source_commit
 
+    successes, trials = _greedy_successes(network)
     network.provenance = {
         "command": command,
         "commit": source_commit(),
@@ -185,7 +188,34 @@ def _save(
         "plans": len(data.goals),
         "plans_solved": int(data.solved.sum()),
         "transitions": len(data.search_actions),
+        "validation_successes_of_gp": f"{successes} of {trials}",
         **details,
     }
     network.save(path)
-    console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+    console.print(
+        f"{path}: {path.stat().st_size / 1e3:.0f} kB; greedily it solves {successes} of "
+        f"{trials} validation tasks."
+    )
+
+
+def _greedy_successes(network: "QNetwork") -> tuple[int, int]:
+    """How many of some validation tasks the greedy policy solves, and of how many.
+
+    There are frozen tasks for three objects only.
+    """
+    from rhp_drake.evaluation.episode import run_episode
+    from rhp_drake.frozen_instances import load_instances
+    from rhp_drake.planning.receding_horizon import RecedingHorizon
+    from rhp_drake.push_model.transition import PushModel
+    from rhp_drake.random_streams import VALIDATION
+
+    instances = load_instances(VALIDATION)[:_VALIDATION_TASKS]
+    if network.num_objects != instances[0].num_objects:
+        return 0, 0
+    world = PushModel(network.num_objects)
+    policy = RecedingHorizon(world, network, 0, 0, 1.0)
+    episodes = [
+        run_episode(world, policy, instance, 0, index)
+        for index, instance in enumerate(instances)
+    ]
+    return sum(episode.succeeded for episode in episodes), len(instances)
