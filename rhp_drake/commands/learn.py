@@ -193,8 +193,8 @@ def _save(
     }
     network.save(path)
     console.print(
-        f"{path}: {path.stat().st_size / 1e3:.0f} kB; greedily it solves {successes} of "
-        f"{trials} validation tasks."
+        f"{path}: {path.stat().st_size / 1e3:.0f} kB, which greedily solves {successes} "
+        f"of {trials} validation tasks."
     )
 
 
