@@ -1,6 +1,7 @@
 """`rhp demos`, `rhp imitate` and `rhp fit`: from plans to a Q-network."""
 
 from pathlib import Path
+import sys
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
@@ -94,7 +95,9 @@ def imitate(
         bar = progress.add_task("Epochs", total=epochs)
         for loss in imitate(network, data, config, stream(seed, "imitation")):
             progress.update(bar, advance=1, description=f"loss {loss:.2f}")
-    _save(network, out, "imitate", data, seed, vars(config) | {"loss": loss}, console)
+    _save(
+        network, out, demonstrations, data, seed, vars(config) | {"loss": loss}, console
+    )
 
 
 def fit(
@@ -143,7 +146,7 @@ def fit(
                 learner.save(checkpoint)
     details = vars(config) | {"loss": learner.mean_loss}
     details["start"] = network.provenance
-    _save(network, out, "fit", data, seed, details, console)
+    _save(network, out, demonstrations, data, seed, details, console)
     checkpoint.unlink(missing_ok=True)
 
 
@@ -171,20 +174,22 @@ def _progress(console: Any) -> Any:
 def _save(
     network: "QNetwork",
     path: Path,
-    command: str,
+    folders: list[Path],
     data: Any,
     seed: int,
     details: dict[str, Any],
     console: Any,
 ) -> None:
     """Writes the weights with where they come from."""
+    from rhp_drake.learning.demonstrations import read_description
     from rhp_drake.run_record import source_commit
 
     successes, trials = _greedy_successes(network)
     network.provenance = {
-        "command": command,
+        "command": " ".join(["rhp", *sys.argv[1:]]),
         "commit": source_commit(),
         "seed": seed,
+        "demonstrations": [read_description(folder) for folder in folders],
         "plans": len(data.goals),
         "plans_solved": int(data.solved.sum()),
         "transitions": len(data.search_actions),
@@ -193,8 +198,8 @@ def _save(
     }
     network.save(path)
     console.print(
-        f"{path}: {path.stat().st_size / 1e3:.0f} kB, which greedily solves {successes} "
-        f"of {trials} validation tasks."
+        f"{path}: {path.stat().st_size / 1e3:.0f} kB, greedily solves {successes} of "
+        f"{trials} validation tasks."
     )
 
 
