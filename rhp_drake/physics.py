@@ -85,8 +85,8 @@ class ObjectPhysics:
                 raise InputError(f"{name} has shape {value.shape}, not {shape}.")
             if not (np.isfinite(value) & (value > 0)).all():
                 raise InputError(f"{name} must be positive and finite: {value}.")
-        for shape, (x, y) in zip(self.shapes, self.side_lengths, strict=True):
-            if shape == CYLINDER and x != y:
+        for name, (x, y) in zip(self.shapes, self.side_lengths, strict=True):
+            if name == CYLINDER and x != y:
                 raise InputError(f"a cylinder's side lengths {x} and {y} must agree.")
 
     def key(self) -> bytes:

@@ -174,7 +174,7 @@ def test_bad_batches_are_refused(push_model, states, actions, message):
 
 def test_physics_of_the_wrong_size_are_refused(push_model):
     states, actions = CAGED[None], np.array([Action.FORWARD])
-    with pytest.raises(ValueError, match="physics 0 .* 2 objects"):
+    with pytest.raises(ValueError, match=r"physics 0 .* 2 objects"):
         push_model.step(states, actions, nominal_physics(2))
     with pytest.raises(ValueError, match="as many physics"):
         push_model.step(states, actions, [nominal_physics(3)] * 2)

@@ -17,9 +17,7 @@ from rhp_drake.physics import ObjectPhysics, nominal_physics
 from rhp_drake.planar_geometry import rectangles_overlap
 from rhp_drake.push_model.diagram import TIME_STEP, MakePushContext, MakePushDiagram
 from rhp_drake.task import (
-    ACTION_DISPLACEMENTS,
     HAND_RECTANGLES,
-    NUM_ACTIONS,
     hand_targets,
 )
 
@@ -30,10 +28,17 @@ STEPS_PER_ACTION: Final = 10
 _SETTLING_STEPS: Final = 1
 # Each with its own physics.
 _SIMULATORS_PER_THREAD: Final = 32
-# m: bodies this far inside each other were put there, not pushed.
-_DEEP_OVERLAP: Final = 0.01
+# m: bodies this far inside each other were put there.  Pushed ones stay below 1 cm,
+# which it takes two boxes jammed between the fingers to reach.
+_DEEP_OVERLAP: Final = 0.02
 # The hand's rectangles as `planar_geometry` wants them, in H.
 _HAND_IN_H: Final = np.insert(HAND_RECTANGLES, 2, 0.0, axis=1)
+# Where the pieces of a path have their middles, and how far each of the hand's
+# rectangles reaches from H, m.
+_MIDWAY: Final = (np.arange(STEPS_PER_ACTION) + 0.5) / STEPS_PER_ACTION
+_REACH: Final = np.linalg.norm(
+    np.abs(HAND_RECTANGLES[:, :2]) + HAND_RECTANGLES[:, 2:], axis=1
+)
 # m: what two bodies at rest in contact may overlap, an error of the contact solver.
 _CONTACT_TOLERANCE: Final = 2e-4
 
@@ -42,36 +47,31 @@ class PushModelError(RuntimeError):
     """The physics of one transition failed; the message names its state."""
 
 
-def _swept_rectangles() -> np.ndarray:
-    """What each piece of each action's path sweeps, in the frame H of its start.
+def _swept_rectangles(motions: np.ndarray) -> np.ndarray:
+    """Rectangles that cover what the hand sweeps in each piece of its path.
+
+    Args:
+        motions: Displacements of the hand in the frame H of its start, shape (N, 3).
 
     Returns:
-        Shape (6, STEPS_PER_ACTION, 3, 5): rectangles of `planar_geometry` that
-        cover the hand's three during that piece.
+        Rectangles of `planar_geometry` in that frame, shape
+        (N, STEPS_PER_ACTION, 3, 5).
     """
-    half_step = 0.5 / STEPS_PER_ACTION
-    fractions = np.arange(STEPS_PER_ACTION) / STEPS_PER_ACTION + half_step
-    swept = np.empty((NUM_ACTIONS, STEPS_PER_ACTION, len(HAND_RECTANGLES), 5))
-    radius = np.linalg.norm(
-        np.abs(HAND_RECTANGLES[:, :2]) + HAND_RECTANGLES[:, 2:], axis=1
-    )
-    for action, displacement in enumerate(ACTION_DISPLACEMENTS):
-        for i, fraction in enumerate(fractions):
-            x, y, theta = fraction * displacement
-            c, s = np.cos(theta), np.sin(theta)
-            hand = HAND_RECTANGLES
-            swept[action, i, :, 0] = x + c * hand[:, 0] - s * hand[:, 1]
-            swept[action, i, :, 1] = y + s * hand[:, 0] + c * hand[:, 1]
-            swept[action, i, :, 2] = theta
-            # A translation along an own axis sweeps just a longer rectangle; in a
-            # rotation no point strays from its midway place by more than its arc.
-            growth = np.abs(half_step * displacement)
-            swept[action, i, :, 3] = hand[:, 2] + growth[0] + growth[2] * radius
-            swept[action, i, :, 4] = hand[:, 3] + growth[1] + growth[2] * radius
-    return swept
-
-
-_SWEPT_RECTANGLES: Final = _swept_rectangles()
+    x, y, theta = np.moveaxis(_MIDWAY[:, None, None] * motions, -1, 0)[..., None]
+    c, s = np.cos(theta), np.sin(theta)
+    hand = HAND_RECTANGLES.T[:, None, None, :]
+    swept = np.empty((STEPS_PER_ACTION, len(motions), len(HAND_RECTANGLES), 5))
+    swept[..., 0] = x + c * hand[0] - s * hand[1]
+    swept[..., 1] = y + s * hand[0] + c * hand[1]
+    swept[..., 2] = theta
+    # Half a piece before and after the middle of the piece; in a rotation no point
+    # strays from there by more than its arc.
+    growth = np.abs(motions) / (2 * STEPS_PER_ACTION)
+    turn = growth[:, 2:] * _REACH
+    # A translation oblique to the hand's axes is covered with some room to spare.
+    swept[..., 3] = hand[2] + growth[:, :1] + turn
+    swept[..., 4] = hand[3] + growth[:, 1:2] + turn
+    return np.moveaxis(swept, 0, 1)
 
 
 def first_touches(
@@ -88,8 +88,7 @@ def first_touches(
         Integers of shape (N,), `STEPS_PER_ACTION` where nothing is touched.
     """
     hand, objects = states[:, :3], states[:, 3:].reshape(len(states), -1, 3)
-    # Objects in the frame H of the action's start, which is where the table of swept
-    # rectangles lives.
+    # All in the frame H of the action's start.
     offsets = objects[..., :2] - hand[:, None, :2]
     c, s = np.cos(hand[:, None, 2]), np.sin(hand[:, None, 2])
     boxes = np.concatenate(
@@ -101,8 +100,17 @@ def first_touches(
         ],
         axis=-1,
     )
+    motions = hand_targets(states, actions) - hand
+    c, s = c[:, 0], s[:, 0]
+    motions = np.column_stack(
+        [
+            c * motions[:, 0] + s * motions[:, 1],
+            c * motions[:, 1] - s * motions[:, 0],
+            motions[:, 2],
+        ]
+    )
     overlaps = rectangles_overlap(
-        _SWEPT_RECTANGLES[actions][:, :, :, None], boxes[:, None, None]
+        _swept_rectangles(motions)[:, :, :, None], boxes[:, None, None]
     )
     touched = np.any(overlaps, axis=(2, 3))
     return np.where(touched.any(axis=1), touched.argmax(axis=1), STEPS_PER_ACTION)
@@ -308,4 +316,4 @@ def overlaps_deeply(states: np.ndarray, side_lengths: np.ndarray) -> np.ndarray:
     with_hand = rectangles_overlap(hand[:, :, None], boxes[:, None])
     first, second = np.triu_indices(boxes.shape[1], 1)
     with_boxes = rectangles_overlap(boxes[:, first], boxes[:, second])
-    return with_hand.any(axis=(1, 2)) | with_boxes.any(axis=1)
+    return np.any(with_hand, axis=(1, 2)) | np.any(with_boxes, axis=1)
