@@ -10,7 +10,8 @@ from rhp_drake.errors import InputError
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
-FRAME_PERIOD: Final = 0.032  # s, as the station's: four periods of the control loop.
+# s between frames: four periods of the robot's commands, eight steps of the physics.
+FRAME_PERIOD: Final = 0.032
 
 
 @dataclass

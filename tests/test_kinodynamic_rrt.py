@@ -66,13 +66,13 @@ def test_limit_of_transitions(push_model):
 
 
 def test_open_loop_executes_its_plan_and_no_more(push_model):
-    instance, found = search(push_model, 0)
+    instance, found = search(push_model, 1)
     policy = OpenLoop(push_model)
     memory, actions = None, []
 
     def decide():
         return policy.decide(
-            instance.initial_state, instance.goals, stream(5, "plan", 0), memory
+            instance.initial_state, instance.goals, stream(5, "plan", 1), memory
         )
 
     for _ in found.actions:

@@ -13,6 +13,10 @@ from rhp_drake.learning.demonstrations import (
     load_demonstrations,
     make_demonstrations,
 )
+from rhp_drake.learning.demonstrators import (
+    PlanningDemonstrator,
+    RecedingHorizonDemonstrator,
+)
 from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, double_q_targets, sample
 from rhp_drake.learning.imitation import (
     ImitationConfig,
@@ -30,11 +34,13 @@ from rhp_drake.task import (
 )
 from rhp_drake.value.q_network import QNetwork
 
+DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("demonstrations")
-    assert list(make_demonstrations(path, PLANS_PER_SHARD, 11, 3, 1)) == [
+    assert list(make_demonstrations(path, PLANS_PER_SHARD, DEMONSTRATOR, 1)) == [
         0,
         PLANS_PER_SHARD,
     ]
@@ -43,28 +49,26 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def data(folder):
-    return load_demonstrations(folder)
+    return load_demonstrations([folder])
 
 
 def test_interrupted_work_goes_on(folder):
     shard = folder / "plans_00000.npz"
     before = shard.stat().st_mtime_ns
     (folder / "plans_00001.npz.123.tmp").write_bytes(b"half a shard")
-    assert list(make_demonstrations(folder, PLANS_PER_SHARD, 11, 3, 1)) == [
+    assert list(make_demonstrations(folder, PLANS_PER_SHARD, DEMONSTRATOR, 1)) == [
         PLANS_PER_SHARD
     ]
     assert shard.stat().st_mtime_ns == before
-    assert len(load_demonstrations(folder).goals) == PLANS_PER_SHARD
+    assert len(load_demonstrations([folder]).goals) == PLANS_PER_SHARD
 
 
-def test_bad_demonstrations_are_named(folder, tmp_path):
+def test_bad_demonstrations_are_named(tmp_path):
     with pytest.raises(InputError, match="holds no demonstrations"):
-        load_demonstrations(tmp_path)
-    with pytest.raises(InputError, match="25 plans, not 100"):
-        load_demonstrations(folder, 100)
+        load_demonstrations([tmp_path])
     (tmp_path / "plans_00000.npz").write_bytes(b"not an archive")
     with pytest.raises(InputError, match=r"plans_00000\.npz"):
-        load_demonstrations(tmp_path)
+        load_demonstrations([tmp_path])
 
 
 def test_demonstrations_hold_plans_that_end_at_the_goal(data):
@@ -77,6 +81,39 @@ def test_demonstrations_hold_plans_that_end_at_the_goal(data):
     # Stored in single precision: an end on a region's border may be rounded out.
     reached = goals_reached(ends, data.goals[data.plan_tasks[last]])
     assert reached.mean() > 0.9
+
+
+def test_folders_join(folder, data):
+    both = load_demonstrations([folder, folder])
+    assert len(both.goals) == 2 * len(data.goals)
+    n = len(data.search_actions)
+    second = both.search_origins[n:]
+    np.testing.assert_array_equal(both.search_origins[:n], data.search_origins)
+    np.testing.assert_array_equal(second < 0, data.search_origins < 0)
+    linked = second >= 0
+    np.testing.assert_array_equal(
+        both.search_next_states[second[linked]], both.search_states[n:][linked]
+    )
+
+
+def test_rhp_demonstrates_with_all_its_roll_outs(tmp_path):
+    weights = tmp_path / "weights.safetensors"
+    torch.manual_seed(0)
+    QNetwork(3).save(weights)
+    made, again = (
+        RecedingHorizonDemonstrator(11, 3, weights).demonstrate(2) for _ in range(2)
+    )
+    for name, array in vars(made).items():
+        np.testing.assert_array_equal(array, getattr(again, name), err_msg=name)
+    pairs = np.column_stack([made.search_states, made.search_actions])
+    # Nothing twice, but for what single precision cannot tell apart.
+    assert len(np.unique(pairs, axis=0)) > 0.95 * len(pairs)
+    linked = made.search_origins >= 0
+    assert linked.any()
+    np.testing.assert_array_equal(
+        made.search_next_states[made.search_origins[linked]],
+        made.search_states[linked],
+    )
 
 
 def test_eq_2():

@@ -9,9 +9,8 @@ import typer
 if TYPE_CHECKING:
     from rhp_drake.value.q_network import QNetwork
 
-_Demos = Annotated[Path, typer.Option(help="Folder of demonstrations.")]
-_Plans = Annotated[
-    int | None, typer.Option(help="Use the first so many plans [default: all].")
+_Demos = Annotated[
+    list[Path], typer.Option(help="Folder of demonstrations; may be repeated.")
 ]
 _Out = Annotated[Path, typer.Option(help="File of the trained weights.")]
 _Seed = Annotated[int, typer.Option(help="Of all random draws.")]
@@ -19,29 +18,44 @@ _Seed = Annotated[int, typer.Option(help="Of all random draws.")]
 
 def demos(
     *,
-    plans: Annotated[int, typer.Option(min=1, help="Training tasks to plan for.")],
+    plans: Annotated[int, typer.Option(min=1, help="Training tasks to solve.")],
     out: Annotated[Path, typer.Option(help="Folder of the shards.")],
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="Act by epsilon-RHP with these weights, do not plan."),
+    ] = None,
+    first_task: Annotated[int, typer.Option(min=0, help="Its number.")] = 0,
     seed: _Seed = 0,
     objects: Annotated[int, typer.Option(min=1, help="m.")] = 3,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
-    """Makes demonstrations: plans of the kinodynamic RRT, and their trees.
+    """Makes demonstrations: plans and all that was simulated to find them.
 
     Stopped at any moment, the same command goes on where it was.
     """
     from rich.console import Console
 
     from rhp_drake.learning.demonstrations import (
+        Demonstrator,
         load_demonstrations,
         make_demonstrations,
     )
+    from rhp_drake.learning.demonstrators import (
+        PlanningDemonstrator,
+        RecedingHorizonDemonstrator,
+    )
+    from rhp_drake.value.q_network import load_q_network
 
+    demonstrator: Demonstrator = PlanningDemonstrator(seed, objects, first_task)
+    if weights is not None:
+        load_q_network(weights, objects)  # Bad weights are better found out here.
+        demonstrator = RecedingHorizonDemonstrator(seed, objects, weights, first_task)
     console = Console()
     with _progress(console) as progress:
         bar = progress.add_task("Plans", total=plans)
-        for done in make_demonstrations(out, plans, seed, objects, workers):
+        for done in make_demonstrations(out, plans, demonstrator, workers):
             progress.update(bar, completed=min(done, plans))
-    data = load_demonstrations(out, plans)
+    data = load_demonstrations([out])
     lengths = data.plan_actions_left[
         [0, *(1 + (data.plan_tasks[1:] != data.plan_tasks[:-1]).nonzero()[0])]
     ]
@@ -55,7 +69,6 @@ def imitate(
     *,
     demonstrations: _Demos,
     out: _Out,
-    plans: _Plans = None,
     seed: _Seed = 0,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the plans.")] = 200,
 ) -> None:
@@ -69,7 +82,7 @@ def imitate(
     from rhp_drake.value.q_network import QNetwork
 
     console = Console()
-    data = load_demonstrations(demonstrations, plans)
+    data = load_demonstrations(demonstrations)
     config = ImitationConfig(num_epochs=epochs)
     torch.manual_seed(seed)
     network = QNetwork(data.goals.shape[1])
@@ -86,7 +99,6 @@ def fit(
     demonstrations: _Demos,
     start: Annotated[Path, typer.Option(help="Weights to start from.")],
     out: _Out,
-    plans: _Plans = None,
     seed: _Seed = 0,
     steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 30_000,
 ) -> None:
@@ -103,7 +115,7 @@ def fit(
     from rhp_drake.value.q_network import load_q_network
 
     console = Console()
-    data = load_demonstrations(demonstrations, plans)
+    data = load_demonstrations(demonstrations)
     network = load_q_network(start, data.goals.shape[1])
     config = FittedQConfig(num_steps=steps)
     learner = FittedQ(network, data, config, stream(seed, "fitted_q"))

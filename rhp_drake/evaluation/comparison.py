@@ -6,6 +6,7 @@ from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from rhp_drake.errors import InputError
@@ -111,14 +112,15 @@ def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
     Actions and computation are means over the runs that succeeded; the last number is
     simulated time over the world's own computation.
     """
-    table = Table(title=title)
-    table.add_column("policy", no_wrap=True)
+    # Without frames, it fits into 80 columns.
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("\npolicy", no_wrap=True)
     table.add_column("success %\n(95 % Wilson)", justify="right", no_wrap=True)
-    table.add_column("actions\na run", justify="right", no_wrap=True)
-    table.add_column("decision, ms\np50 / p95", justify="right", no_wrap=True)
-    table.add_column("computing\na run, s", justify="right", no_wrap=True)
-    table.add_column("world, x\nreal time", justify="right", no_wrap=True)
-    table.add_column("failures")
+    table.add_column("\nactions", justify="right", no_wrap=True)
+    table.add_column("ms a decision\np50 / p95", justify="right", no_wrap=True)
+    table.add_column("thinks\ns a run", justify="right", no_wrap=True)
+    table.add_column("x real\ntime", justify="right", no_wrap=True)
+    table.add_column("\nfailures")
     for policy in dict.fromkeys(trial.policy for trial, _ in results):
         episodes = [episode for trial, episode in results if trial.policy == policy]
         successes = [episode for episode in episodes if episode.succeeded]

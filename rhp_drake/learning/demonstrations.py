@@ -1,34 +1,29 @@
-"""Demonstrations: plans of the kinodynamic RRT and the trees they grew in, as files.
+"""Demonstrations: plans, and all that was simulated to find them, as files.
 
-A folder holds shards of `PLANS_PER_SHARD` plans each.  A shard depends on the seed
-and its index alone, and is written whole or not at all: work that was interrupted
-goes on where it stopped, whatever the number of workers.
+A folder holds shards of `PLANS_PER_SHARD` plans each.  A shard depends on the
+demonstrator and its index alone, and is written whole or not at all: work that was
+interrupted goes on where it stopped, whatever the number of workers.
 
 A shard is an NPZ file of the arrays that `Demonstrations` describes.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 import io
 from pathlib import Path
 import re
-from typing import Final
+from typing import Final, Protocol
 import zipfile
 
 import numpy as np
 
 from rhp_drake.errors import InputError
 from rhp_drake.files import write_atomically
-from rhp_drake.planning.kinodynamic_rrt import plan
-from rhp_drake.push_model.transition import PushModel
-from rhp_drake.random_streams import TRAINING, stream
-from rhp_drake.task import sample_instance
+from rhp_drake.planning.search import Search
 from rhp_drake.workers import run_over
 
 PLANS_PER_SHARD: Final = 25
-# A task not solved with this many simulated actions yields its tree but no plan.
-MAX_TRANSITIONS: Final = 6000
 
 
 @dataclass(frozen=True)
@@ -87,23 +82,31 @@ def _concatenate(parts: list[Demonstrations]) -> Demonstrations:
     return Demonstrations(**arrays)
 
 
-def demonstrate(push_model: PushModel, seed: int, index: int) -> Demonstrations:
-    """Plans for training task number `index` under `seed`."""
-    instance = sample_instance(stream(seed, TRAINING, index), push_model.num_objects)
-    found = plan(
-        push_model,
-        instance.initial_state,
-        instance.goals,
-        stream(seed, TRAINING, index, "kinodynamic_rrt"),
-        max_transitions=MAX_TRANSITIONS,
-    )
-    solved = found.actions is not None
-    actions = found.actions if found.actions is not None else np.empty(0, int)
-    search = found.search
+class Demonstrator(Protocol):
+    """Whoever solves training tasks; it is sent to other processes."""
+
+    def demonstrate(self, index: int) -> Demonstrations:
+        """Solves task number `index`, or fails to; depends on nothing else."""
+        ...
+
+
+def make_demonstration(
+    goals: np.ndarray, actions: np.ndarray | None, states: np.ndarray, search: Search
+) -> Demonstrations:
+    """What came of one task.
+
+    Args:
+        goals: Shape (m, 2).
+        actions: Those that led to the goal, shape (L,); None if none did.
+        states: Where they were taken, shape (L, 3 + 3 m) or more.
+        search: All that was simulated.
+    """
+    solved = actions is not None
+    actions = actions if actions is not None else np.empty(0, int)
     return Demonstrations(
-        goals=instance.goals[None],
+        goals=goals[None],
         plan_tasks=np.zeros(len(actions), np.int32),
-        plan_states=found.states[: len(actions)].astype(np.float32),
+        plan_states=states[: len(actions)].astype(np.float32),
         plan_actions=actions.astype(np.int8),
         plan_actions_left=np.arange(len(actions), 0, -1, dtype=np.int16),
         search_tasks=np.zeros(len(search.actions), np.int32),
@@ -116,12 +119,11 @@ def demonstrate(push_model: PushModel, seed: int, index: int) -> Demonstrations:
     )
 
 
-def _make_shard(shard: int, folder: Path, seed: int, num_objects: int) -> int:
-    push_model = PushModel(num_objects)
+def _make_shard(shard: int, folder: Path, demonstrator: Demonstrator) -> int:
     first = shard * PLANS_PER_SHARD
     demonstrations = _concatenate(
         [
-            demonstrate(push_model, seed, index)
+            demonstrator.demonstrate(index)
             for index in range(first, first + PLANS_PER_SHARD)
         ]
     )
@@ -136,7 +138,7 @@ def _shard_path(folder: Path, shard: int) -> Path:
 
 
 def make_demonstrations(
-    folder: Path, num_plans: int, seed: int, num_objects: int, num_workers: int
+    folder: Path, num_plans: int, demonstrator: Demonstrator, num_workers: int
 ) -> Iterator[int]:
     """Makes the shards that `num_plans` tasks need and `folder` lacks.
 
@@ -147,42 +149,32 @@ def make_demonstrations(
     missing = [shard for shard in shards if not _shard_path(folder, shard).exists()]
     done = (len(shards) - len(missing)) * PLANS_PER_SHARD
     yield done
-    make = partial(_make_shard, folder=folder, seed=seed, num_objects=num_objects)
+    make = partial(_make_shard, folder=folder, demonstrator=demonstrator)
     for _ in run_over(make, missing, num_workers):
         done += PLANS_PER_SHARD
         yield done
 
 
-def load_demonstrations(folder: Path, num_plans: int | None = None) -> Demonstrations:
-    """Reads a folder's shards, in order.
-
-    Args:
-        folder: Made by `make_demonstrations`.
-        num_plans: How many tasks to read, all of them if None.
+def load_demonstrations(folders: Sequence[Path]) -> Demonstrations:
+    """Reads the shards of some folders, in order.
 
     Raises:
-        InputError: If a shard cannot be read, or there are not enough.
+        InputError: If a shard cannot be read, or a folder has none.
     """
-    paths = sorted(
-        path
-        for path in folder.glob("plans_*.npz")
-        if re.fullmatch(r"plans_\d{5}\.npz", path.name)
-    )
-    if num_plans is not None:
-        needed = -(-num_plans // PLANS_PER_SHARD)
-        if len(paths) < needed:
-            raise InputError(
-                f"{folder} holds {len(paths) * PLANS_PER_SHARD} plans, not {num_plans}."
-            )
-        paths = paths[:needed]
-    if not paths:
-        raise InputError(f"{folder} holds no demonstrations (plans_*.npz).")
     names = {field.name for field in fields(Demonstrations)}
     parts = []
-    for path in paths:
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                parts.append(Demonstrations(**{name: arrays[name] for name in names}))
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: not a readable shard ({error}).") from error
+    for folder in folders:
+        paths = sorted(
+            path
+            for path in folder.glob("plans_*.npz")
+            if re.fullmatch(r"plans_\d{5}\.npz", path.name)
+        )
+        if not paths:
+            raise InputError(f"{folder} holds no demonstrations (plans_*.npz).")
+        for path in paths:
+            try:
+                with np.load(path, allow_pickle=False) as arrays:
+                    parts.append(Demonstrations(**{n: arrays[n] for n in names}))
+            except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+                raise InputError(f"{path}: not a readable shard ({error}).") from error
     return _concatenate(parts)

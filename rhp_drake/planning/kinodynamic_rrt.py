@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from rhp_drake.planning.search import Search, SearchRecord
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
@@ -52,23 +53,6 @@ _WIDEST_PUSH: Final = math.radians(100)
 
 
 @dataclass(frozen=True)
-class Transitions:
-    """T simulated actions.
-
-    Attributes:
-        states: Shape (T, 3 + 3 m).
-        actions: Shape (T,).
-        next_states: Shape (T, 3 + 3 m).
-        origins: For each, which one led to its state; -1 at a root.  Shape (T,).
-    """
-
-    states: np.ndarray
-    actions: np.ndarray
-    next_states: np.ndarray
-    origins: np.ndarray
-
-
-@dataclass(frozen=True)
 class Plan:
     """What the planner found.
 
@@ -81,7 +65,7 @@ class Plan:
 
     actions: np.ndarray | None
     states: np.ndarray
-    search: Transitions
+    search: Search
     seconds: float
 
 
@@ -110,46 +94,6 @@ def _hand_actions(
         + np.maximum(turn - _WIDEST_PUSH, 0) / ROTATION
         + outside * misalignment / ROTATION
     )
-
-
-class _Record:
-    """Collects what is simulated."""
-
-    def __init__(self, state_size: int) -> None:
-        self._states = [np.empty((0, state_size))]
-        self._actions = [np.empty(0, int)]
-        self._next_states = [np.empty((0, state_size))]
-        self._origins = [np.empty(0, int)]
-        self.num_transitions = 0
-
-    def add(
-        self,
-        state: np.ndarray,
-        actions: np.ndarray,
-        children: np.ndarray,
-        origin: int,
-    ) -> np.ndarray:
-        """Adds the children (A, 3 + 3 m) that actions (A,) led to from one state.
-
-        Returns:
-            The transitions' indices, shape (A,).
-        """
-        self._states.append(np.repeat(state[None], len(actions), axis=0))
-        self._actions.append(actions)
-        self._next_states.append(children)
-        self._origins.append(np.full(len(actions), origin))
-        first = self.num_transitions
-        self.num_transitions += len(actions)
-        return np.arange(first, self.num_transitions)
-
-    def transitions(self) -> Transitions:
-        """All of them, in order."""
-        return Transitions(
-            np.concatenate(self._states),
-            np.concatenate(self._actions),
-            np.concatenate(self._next_states),
-            np.concatenate(self._origins),
-        )
 
 
 class _Tree:
@@ -244,7 +188,7 @@ def plan(
     """
     begin = time.perf_counter()
     tree = _Tree(state, goals, generator)
-    record = _Record(len(state))
+    record = SearchRecord(len(state))
     found = (np.empty(0, int), state[None]) if goals_reached(state, goals) else None
     restart_at = _RESTART
     while found is None and record.num_transitions < max_transitions:
@@ -267,8 +211,8 @@ def plan(
         found = _grow(tree, node, actions, children, indices)
     seconds = time.perf_counter() - begin
     if found is None:
-        return Plan(None, state[None], record.transitions(), seconds)
-    return Plan(*found, record.transitions(), seconds)
+        return Plan(None, state[None], record.search(), seconds)
+    return Plan(*found, record.search(), seconds)
 
 
 def _grow(

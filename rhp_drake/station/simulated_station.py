@@ -38,10 +38,10 @@ from rhp_drake.station.ports import JOINT_NAMES, NUM_JOINTS
 from rhp_drake.station.position_servo import PositionServo
 from rhp_drake.station.ur5_kinematics import PUSHING_HEIGHT, inverse_kinematics
 from rhp_drake.task import BOX_SIDE
+from rhp_drake.visualization import FRAME_PERIOD
 
 _TARGET_COLOR = Rgba(0.20, 0.66, 0.33)
 _OBSTACLE_COLOR = Rgba(0.80, 0.16, 0.14)
-_FRAME_PERIOD = 0.032  # s between Meshcat's frames; a multiple of every time step.
 
 
 def _default_directives() -> list[ModelDirective]:
@@ -173,7 +173,7 @@ def MakeSimulatedStation(
             builder,
             scene_graph.get_query_output_port(),
             meshcat,
-            MeshcatVisualizerParams(publish_period=_FRAME_PERIOD),
+            MeshcatVisualizerParams(publish_period=FRAME_PERIOD),
         )
     station = robot_builder.Build()
     station.set_name("station")

@@ -1,0 +1,158 @@
+"""Who makes demonstrations: the kinodynamic RRT, and RHP with weights it has."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from rhp_drake.learning.demonstrations import Demonstrations, make_demonstration
+from rhp_drake.planning.kinodynamic_rrt import plan
+from rhp_drake.planning.policy import PolicyError
+from rhp_drake.planning.receding_horizon import RecedingHorizon
+from rhp_drake.planning.search import Search, SearchRecord
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.random_streams import TRAINING, stream
+from rhp_drake.task import (
+    MAX_ACTIONS,
+    allowed_actions,
+    goals_reached,
+    objects_fallen,
+    sample_instance,
+)
+from rhp_drake.value.q_network import load_q_network
+
+# A task not solved with this many simulated actions yields its trees but no plan.
+_MAX_TRANSITIONS: Final = 6000
+
+
+@dataclass(frozen=True)
+class PlanningDemonstrator:
+    """Plans with the kinodynamic RRT (section IV-A of the paper).
+
+    Attributes:
+        seed: Of the tasks and the searches.
+        num_objects: m.
+        first_task: Number of the first task.
+    """
+
+    seed: int
+    num_objects: int
+    first_task: int = 0
+
+    @cached_property
+    def _push_model(self) -> PushModel:
+        return PushModel(self.num_objects)
+
+    def demonstrate(self, index: int) -> Demonstrations:
+        """See `demonstrations.Demonstrator`."""
+        task = self.first_task + index
+        instance = sample_instance(stream(self.seed, TRAINING, task), self.num_objects)
+        found = plan(
+            self._push_model,
+            instance.initial_state,
+            instance.goals,
+            stream(self.seed, TRAINING, task, "kinodynamic_rrt"),
+            max_transitions=_MAX_TRANSITIONS,
+        )
+        return make_demonstration(
+            instance.goals, found.actions, found.states, found.search
+        )
+
+
+@dataclass(frozen=True)
+class RecedingHorizonDemonstrator:
+    """Acts by epsilon-RHP (section V of the paper), and keeps all its roll-outs.
+
+    Attributes:
+        seed: Of the tasks and the policy.
+        num_objects: m.
+        weights: File of the Q-network.
+        first_task: Number of the first task.
+        epsilon: How often the action is a random one.
+        temperature: tau of Eq. 5, in actions.
+    """
+
+    seed: int
+    num_objects: int
+    weights: Path
+    first_task: int = 0
+    epsilon: float = 0.1
+    temperature: float = 0.5
+
+    @cached_property
+    def _recorder(self) -> "_RecordingPushModel":
+        return _RecordingPushModel(self.num_objects)
+
+    @cached_property
+    def _policy(self) -> RecedingHorizon:
+        q_network = load_q_network(self.weights, self.num_objects)
+        return RecedingHorizon(self._recorder, q_network, 6, 6, self.temperature)
+
+    def demonstrate(self, index: int) -> Demonstrations:
+        """See `demonstrations.Demonstrator`."""
+        task = self.first_task + index
+        instance = sample_instance(stream(self.seed, TRAINING, task), self.num_objects)
+        generator = stream(self.seed, TRAINING, task, "epsilon_rhp")
+        state, goals = instance.initial_state, instance.goals
+        self._recorder.forget()
+        states, actions = [], []
+        for _ in range(MAX_ACTIONS):
+            explores = generator.random() < self.epsilon
+            try:
+                decision = self._policy.decide(state, goals, generator)
+            except PolicyError:
+                break
+            action = decision.action
+            if explores:
+                action = int(generator.choice(np.flatnonzero(allowed_actions(state))))
+            states.append(state)
+            actions.append(action)
+            state = self._recorder.step(state[None], np.array([action]))[0]
+            if goals_reached(state, goals) or objects_fallen(state):
+                break
+        solved = bool(goals_reached(state, goals))
+        return make_demonstration(
+            goals,
+            np.array(actions) if solved else None,
+            np.array(states),
+            self._recorder.search(),
+        )
+
+
+class _RecordingPushModel(PushModel):
+    """Remembers what it simulates, and simulates nothing twice."""
+
+    def __init__(self, num_objects: int) -> None:
+        super().__init__(num_objects)
+        self.forget()
+
+    def forget(self) -> None:
+        """Starts an empty record."""
+        self._record = SearchRecord(3 + 3 * self.num_objects)
+        self._known: dict[tuple[bytes, int], np.ndarray] = {}
+        # Which transition led to each state.
+        self._origins: dict[bytes, int] = {}
+
+    def search(self) -> Search:
+        """All that was simulated since."""
+        return self._record.search()
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """See `PushModel.step`."""
+        keys = [
+            (state.tobytes(), int(action))
+            for state, action in zip(states, actions, strict=True)
+        ]
+        new = [i for i, key in enumerate(keys) if key not in self._known]
+        if new:
+            children = super().step(states[new], actions[new])
+            for i, child in zip(new, children, strict=True):
+                self._known[keys[i]] = child
+                origin = self._origins.get(keys[i][0], -1)
+                (index,) = self._record.add(
+                    states[i], actions[i : i + 1], child[None], origin
+                )
+                self._origins.setdefault(child.tobytes(), int(index))
+        return np.array([self._known[key] for key in keys])
