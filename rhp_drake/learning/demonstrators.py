@@ -121,16 +121,16 @@ class RecedingHorizonDemonstrator:
         )
 
 
-class _RecordingPushModel(PushModel):
-    """Remembers what it simulates, and simulates nothing twice."""
+class _RecordingPushModel:
+    """A push model that remembers what it simulates, and simulates nothing twice."""
 
     def __init__(self, num_objects: int) -> None:
-        super().__init__(num_objects)
+        self._push_model = PushModel(num_objects)
         self.forget()
 
     def forget(self) -> None:
         """Starts an empty record."""
-        self._record = SearchRecord(3 + 3 * self.num_objects)
+        self._record = SearchRecord(3 + 3 * self._push_model.num_objects)
         self._known: dict[tuple[bytes, int], np.ndarray] = {}
         # Which transition led to each state.
         self._origins: dict[bytes, int] = {}
@@ -147,7 +147,7 @@ class _RecordingPushModel(PushModel):
         ]
         new = [i for i, key in enumerate(keys) if key not in self._known]
         if new:
-            children = super().step(states[new], actions[new])
+            children = self._push_model.step(states[new], actions[new])
             for i, child in zip(new, children, strict=True):
                 self._known[keys[i]] = child
                 origin = self._origins.get(keys[i][0], -1)

@@ -6,7 +6,6 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from rhp_drake.planning.policy import Decision, PolicyError
-from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     HAND_ACTIONS,
     MAX_ACTIONS,
@@ -19,6 +18,14 @@ from rhp_drake.task import (
 # The return of a state from which the goal cannot be reached any more: never within
 # the limit of actions.
 FAILURE_VALUE: Final = REWARD * MAX_ACTIONS
+
+
+class TransitionFunction(Protocol):
+    """Whatever predicts T(s, a), e.g. a `PushModel`."""
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Next states (N, 3 + 3 m) of states (N, 3 + 3 m) and actions (N,)."""
+        ...
 
 
 class ValueFunction(Protocol):
@@ -78,7 +85,7 @@ class RecedingHorizon:
         action_set: The actions whose values the value function gives, in its order.
     """
 
-    push_model: PushModel
+    push_model: TransitionFunction
     value_function: ValueFunction
     num_roll_outs: int
     horizon: int
