@@ -78,8 +78,9 @@ def MakeClosedLoop(
     builder = DiagramBuilder()
     try:
         station = MakeSimulatedStation(scenario.station, meshcat)
-    except (RuntimeError, ValueError) as error:
-        # Words of Drake's about models and settings that come from the scenario.
+    except (RuntimeError, ValueError, SystemExit) as error:
+        # Words of Drake's about models and settings that come from the scenario.  A
+        # failed assertion in Drake comes as a SystemExit.
         raise InputError(f"station: {error}") from error
     builder.AddNamedSystem("station", station)
     estimator = builder.AddNamedSystem("state_estimator", StateEstimator(m))

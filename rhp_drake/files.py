@@ -3,6 +3,22 @@
 import os
 from pathlib import Path
 
+from rhp_drake.errors import InputError
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder and those above it, unless there.
+
+    Long work does so before it begins, not to learn at its end that it cannot be.
+
+    Raises:
+        InputError: If it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: no folder can be made: {error.strerror}.") from None
+
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes under another name in the same folder, then renames.
@@ -10,7 +26,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     Whoever reads `path` sees the old content or the new, never a half; the folder is
     made if need be.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     data = content.encode() if isinstance(content, str) else content
     try:

@@ -165,6 +165,8 @@ def check_scenario(scenario: Scenario) -> None:
     """Raises InputError if a value of the right type is impossible all the same."""
     _check(scenario.seed >= 0, "seed", scenario.seed, "at least 0")
     _check(scenario.time_limit > 0, "time_limit", scenario.time_limit, "positive")
+    time_step = scenario.station.plant.time_step
+    _check(time_step > 0, "station.plant.time_step", time_step, "positive")
     levels = ", ".join(UNCERTAINTY_LEVELS)
     known = scenario.world_physics in UNCERTAINTY_LEVELS
     _check(known, "world_physics", scenario.world_physics, f"one of {levels}")

@@ -53,6 +53,7 @@ def test_each_command_has_help(command, monkeypatch, capsys):
         (["--world", "moon"], "'moon' is not a world: planar, station."),
         (["--temperature", "0"], "policy.temperature is 0.0; it must be above 0."),
         (["--weights", "missing", "--policies", "gp"], "missing: there is no such fi"),
+        (["--out", "/dev/null/out.json"], "/dev/null: no folder can be made: "),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

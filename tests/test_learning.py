@@ -12,6 +12,7 @@ from rhp_drake.learning.demonstrations import (
     PLANS_PER_SHARD,
     load_demonstrations,
     make_demonstrations,
+    read_description,
 )
 from rhp_drake.learning.demonstrators import (
     PlanningDemonstrator,
@@ -61,6 +62,13 @@ def test_interrupted_work_goes_on(folder):
     ]
     assert shard.stat().st_mtime_ns == before
     assert len(load_demonstrations([folder]).goals) == PLANS_PER_SHARD
+
+
+def test_a_folder_is_one_demonstrator_s(folder):
+    assert "seed=11" in read_description(folder)["demonstrator"]
+    other = PlanningDemonstrator(seed=12, num_objects=3)
+    with pytest.raises(InputError, match="seed=11"):
+        next(make_demonstrations(folder, PLANS_PER_SHARD, other, 1))
 
 
 def test_bad_demonstrations_are_named(tmp_path):

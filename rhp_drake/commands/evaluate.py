@@ -39,6 +39,7 @@ def evaluate(
 
     from rhp_drake.evaluation.comparison import Comparison, make_table, run_comparison
     from rhp_drake.evaluation.statistics import describe_machine
+    from rhp_drake.files import make_folder
 
     comparison = Comparison(
         {name: _config(name, weights, temperature) for name in policies.split(",")},
@@ -47,6 +48,8 @@ def evaluate(
         world,
         seed,
     )
+    if out is not None:
+        make_folder(out.parent)
     console = Console()
     trials = run_comparison(comparison, workers)
     total = len(comparison.trials())

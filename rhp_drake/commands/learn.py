@@ -1,9 +1,12 @@
 """`rhp demos`, `rhp imitate` and `rhp fit`: from plans to a Q-network."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+import sys
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+
+_VALIDATION_TASKS: Final = 200
 
 # torch and Drake are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -81,6 +84,7 @@ def imitate(
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import QNetwork
 
+    torch.set_flush_denormal(True)
     console = Console()
     data = load_demonstrations(demonstrations)
     config = ImitationConfig(num_epochs=epochs)
@@ -91,7 +95,9 @@ def imitate(
         bar = progress.add_task("Epochs", total=epochs)
         for loss in imitate(network, data, config, stream(seed, "imitation")):
             progress.update(bar, advance=1, description=f"loss {loss:.2f}")
-    _save(network, out, "imitate", data, seed, vars(config) | {"loss": loss}, console)
+    _save(
+        network, out, demonstrations, data, seed, vars(config) | {"loss": loss}, console
+    )
 
 
 def fit(
@@ -108,12 +114,15 @@ def fit(
     beside the weights.
     """
     from rich.console import Console
+    import torch
 
     from rhp_drake.learning.demonstrations import load_demonstrations
     from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import load_q_network
 
+    # Gradients of dead units get so small that arithmetic takes five times as long.
+    torch.set_flush_denormal(True)
     console = Console()
     data = load_demonstrations(demonstrations)
     network = load_q_network(start, data.goals.shape[1])
@@ -137,7 +146,7 @@ def fit(
                 learner.save(checkpoint)
     details = vars(config) | {"loss": learner.mean_loss}
     details["start"] = network.provenance
-    _save(network, out, "fit", data, seed, details, console)
+    _save(network, out, demonstrations, data, seed, details, console)
     checkpoint.unlink(missing_ok=True)
 
 
@@ -165,23 +174,53 @@ def _progress(console: Any) -> Any:
 def _save(
     network: "QNetwork",
     path: Path,
-    command: str,
+    folders: list[Path],
     data: Any,
     seed: int,
     details: dict[str, Any],
     console: Any,
 ) -> None:
     """Writes the weights with where they come from."""
+    from rhp_drake.learning.demonstrations import read_description
     from rhp_drake.run_record import source_commit
 
+    successes, trials = _greedy_successes(network)
     network.provenance = {
-        "command": command,
+        "command": " ".join(["rhp", *sys.argv[1:]]),
         "commit": source_commit(),
         "seed": seed,
+        "demonstrations": [read_description(folder) for folder in folders],
         "plans": len(data.goals),
         "plans_solved": int(data.solved.sum()),
         "transitions": len(data.search_actions),
+        "validation_successes_of_gp": f"{successes} of {trials}",
         **details,
     }
     network.save(path)
-    console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+    console.print(
+        f"{path}: {path.stat().st_size / 1e3:.0f} kB, greedily solves {successes} of "
+        f"{trials} validation tasks."
+    )
+
+
+def _greedy_successes(network: "QNetwork") -> tuple[int, int]:
+    """How many of some validation tasks the greedy policy solves, and of how many.
+
+    There are frozen tasks for three objects only.
+    """
+    from rhp_drake.evaluation.episode import run_episode
+    from rhp_drake.frozen_instances import load_instances
+    from rhp_drake.planning.receding_horizon import RecedingHorizon
+    from rhp_drake.push_model.transition import PushModel
+    from rhp_drake.random_streams import VALIDATION
+
+    instances = load_instances(VALIDATION)[:_VALIDATION_TASKS]
+    if network.num_objects != instances[0].num_objects:
+        return 0, 0
+    world = PushModel(network.num_objects)
+    policy = RecedingHorizon(world, network, 0, 0, 1.0)
+    episodes = [
+        run_episode(world, policy, instance, 0, index)
+        for index, instance in enumerate(instances)
+    ]
+    return sum(episode.succeeded for episode in episodes), len(instances)

@@ -117,7 +117,7 @@ def _run(
     from rich.console import Console
 
     from rhp_drake.closed_loop import MakeClosedLoop, Outcome, run_closed_loop
-    from rhp_drake.files import write_atomically
+    from rhp_drake.files import make_folder, write_atomically
     from rhp_drake.physics import draw_physics
     from rhp_drake.planning.policy_config import MakePolicy
     from rhp_drake.random_streams import stream
@@ -140,7 +140,7 @@ def _run(
     simulator = Simulator(MakeClosedLoop(scenario, policy, meshcat))
     if realtime:
         simulator.set_target_realtime_rate(1.0)
-    _make_folder(folder)
+    make_folder(folder)
 
     console.print(f"{title}, seed {scenario.seed}", style="bold")
     if scenario.description:
@@ -211,11 +211,3 @@ def _decision_line(record: "DecisionRecord") -> str:
 def _default_folder() -> Path:
     """A new name for each run, which sorts by time."""
     return Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
-
-
-def _make_folder(folder: Path) -> None:
-    """Makes the folder before the run, not to learn after it that it cannot be."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out: {folder}: {error.strerror}.") from None

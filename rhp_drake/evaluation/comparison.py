@@ -21,6 +21,9 @@ PLANAR: Final = "planar"
 STATION: Final = "station"
 WORLDS: Final = (PLANAR, STATION)
 
+# Table I of the paper, without uncertainty: success in % after imitation alone.
+_PAPER_SUCCESS: Final = {"kdp": 98, "gp": 48, "rhp33": 78, "rhp66": 88}
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -109,6 +112,7 @@ def run_comparison(
 def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
     """A table of success, causes of failure, and cost, a row a policy.
 
+    Beside the success stands what the paper's imitation columns say of the policy.
     Actions and computation are means over the runs that succeeded; the last number is
     simulated time over the world's own computation.
     """
@@ -116,6 +120,7 @@ def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("\npolicy", no_wrap=True)
     table.add_column("success %\n(95 % Wilson)", justify="right", no_wrap=True)
+    table.add_column("paper\n%", justify="right", no_wrap=True)
     table.add_column("\nactions", justify="right", no_wrap=True)
     table.add_column("ms a decision\np50 / p95", justify="right", no_wrap=True)
     table.add_column("thinks\ns a run", justify="right", no_wrap=True)
@@ -133,6 +138,7 @@ def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
         table.add_row(
             policy,
             format_rate(len(successes), len(episodes)),
+            str(_PAPER_SUCCESS.get(policy, "")),
             f"{_mean([e.num_actions for e in successes]):.1f}",
             f"{p50:.1f} / {p95:.1f}",
             f"{_mean([sum(e.decision_seconds) for e in successes]):.2f}",

@@ -4,13 +4,15 @@ A folder holds shards of `PLANS_PER_SHARD` plans each.  A shard depends on the
 demonstrator and its index alone, and is written whole or not at all: work that was
 interrupted goes on where it stopped, whatever the number of workers.
 
-A shard is an NPZ file of the arrays that `Demonstrations` describes.
+A shard is an NPZ file of the arrays that `Demonstrations` describes; the file
+`demonstrator.json` says who made them.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 import io
+import json
 from pathlib import Path
 import re
 from typing import Final, Protocol
@@ -58,6 +60,8 @@ class Demonstrations:
     num_transitions: np.ndarray
     solved: np.ndarray
 
+
+_DESCRIPTION: Final = "demonstrator.json"
 
 # Arrays that hold indices, and the array whose rows they count.
 _INDICES: Final = {
@@ -144,7 +148,14 @@ def make_demonstrations(
 
     Yields:
         The number of tasks done, after each shard.
+
+    Raises:
+        InputError: If the folder holds the work of another demonstrator.
     """
+    description = {"demonstrator": repr(demonstrator)}
+    if read_description(folder) not in ({}, description):
+        raise InputError(f"{folder} holds the work of {read_description(folder)}.")
+    write_atomically(folder / _DESCRIPTION, json.dumps(description) + "\n")
     shards = range(-(-num_plans // PLANS_PER_SHARD))
     missing = [shard for shard in shards if not _shard_path(folder, shard).exists()]
     done = (len(shards) - len(missing)) * PLANS_PER_SHARD
@@ -153,6 +164,17 @@ def make_demonstrations(
     for _ in run_over(make, missing, num_workers):
         done += PLANS_PER_SHARD
         yield done
+
+
+def read_description(folder: Path) -> dict[str, str]:
+    """Who made a folder's demonstrations; empty if it does not say."""
+    path = folder / _DESCRIPTION
+    if not path.exists():
+        return {}
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise InputError(f"{path}: not a readable description ({error}).") from error
 
 
 def load_demonstrations(folders: Sequence[Path]) -> Demonstrations:
