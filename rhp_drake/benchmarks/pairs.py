@@ -1,5 +1,6 @@
 """The (state, action) pairs that the push model is measured on."""
 
+import math
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -8,6 +9,8 @@ from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
     HAND_ACTIONS,
+    WORKSPACE_LOWER,
+    WORKSPACE_UPPER,
     object_positions,
     overlapping_bodies,
     sample_instance,
@@ -40,7 +43,7 @@ def sample_contact_pairs(count: int, num_objects: int, seed: int) -> Pairs:
     states: list[np.ndarray] = []
     actions: list[int] = []
     while len(states) < count:
-        state = sample_instance(generator, num_objects).initial_state.copy()
+        state = _sample_scene(generator, num_objects)
         box = object_positions(state)[generator.integers(num_objects)]
         state[:2] = box + generator.uniform(-_NEAR, _NEAR, size=2)
         action = int(generator.choice(HAND_ACTIONS))
@@ -51,6 +54,20 @@ def sample_contact_pairs(count: int, num_objects: int, seed: int) -> Pairs:
             states.append(state)
             actions.append(action)
     return np.array(states), np.array(actions)
+
+
+def _sample_scene(generator: np.random.Generator, num_objects: int) -> np.ndarray:
+    """A state with boxes anywhere and the hand far away.
+
+    Boxes come one by one: ten at once would hardly ever fit.
+    """
+    state = np.array([10.0, 10.0, generator.uniform(-math.pi, math.pi)])
+    while len(state) < 3 + 3 * num_objects:
+        x, y = generator.uniform(WORKSPACE_LOWER, WORKSPACE_UPPER)
+        box = [x, y, generator.uniform(-math.pi, math.pi)]
+        if not overlapping_bodies(np.append(state, box), _CLEARANCE):
+            state = np.append(state, box)
+    return state
 
 
 def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
