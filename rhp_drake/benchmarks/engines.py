@@ -1,6 +1,7 @@
 """The engines that are compared: the push model, and those that are installed."""
 
 from collections.abc import Callable
+from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Final
 
@@ -38,6 +39,12 @@ _ENGINES: Final[dict[str, tuple[str, Callable[[int, int], PlanarWorld]]]] = {
 def available_engines() -> list[str]:
     """Names of the engines whose packages are installed, the push model first."""
     return [name for name, (package, _) in _ENGINES.items() if find_spec(package)]
+
+
+def describe_engines() -> str:
+    """The versions of the other engines, e.g. ``Box2D 2.3.10, mujoco none``."""
+    packages = [package for _, (package, _) in list(_ENGINES.items())[1:]]
+    return ", ".join(f"{p} {version(p) if find_spec(p) else 'none'}" for p in packages)
 
 
 def make_engine(name: str, num_objects: int, refinement: int = 1) -> PlanarWorld:

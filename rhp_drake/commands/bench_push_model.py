@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from rhp_drake.benchmarks.decision import DecisionTimes
-    from rhp_drake.benchmarks.other_worlds import WorldTrial
+    from rhp_drake.benchmarks.other_worlds import World, WorldTrial
     from rhp_drake.benchmarks.push_model import Accuracy, Errors, Speed, Spread
     from rhp_drake.evaluation.episode import Episode
 
@@ -50,6 +50,7 @@ def push_model(
     """
     from rich.console import Console
 
+    from rhp_drake.benchmarks.engines import describe_engines
     from rhp_drake.evaluation.statistics import describe_machine
 
     # Before the minutes of work.
@@ -62,7 +63,7 @@ def push_model(
         results["closed_loop"] = _measure_closed_loop(
             console, instances, weights_path, workers
         )
-    results["machine"] = describe_machine(workers)
+    results["machine"] = f"{describe_machine(workers)}, {describe_engines()}"
     console.print(results["machine"])
     if out is not None:
         import json
@@ -163,7 +164,7 @@ def _measure_closed_loop(
             console=console,
         )
     )
-    console.print(_closed_loop_table(results, f"{count} validation instances"))
+    console.print(_closed_loop_table(results, worlds, f"{count} validation instances"))
     return [asdict(trial) | asdict(episode) for trial, episode in results]
 
 
@@ -246,7 +247,9 @@ def _decision_table(times: "Sequence[DecisionTimes]") -> "Table":
 
 
 def _closed_loop_table(
-    results: "Sequence[tuple[WorldTrial, Episode]]", title: str
+    results: "Sequence[tuple[WorldTrial, Episode]]",
+    worlds: "Sequence[World]",
+    title: str,
 ) -> "Table":
     from rich.table import Table
 
@@ -256,9 +259,7 @@ def _closed_loop_table(
     table.add_column("world", no_wrap=True)
     table.add_column("steps", justify="right", no_wrap=True)
     table.add_column("success %\n(95 % Wilson)", justify="right", no_wrap=True)
-    for world in sorted(
-        {trial.world for trial, _ in results}, key=lambda w: (w.refinement, w.engine)
-    ):
+    for world in worlds:
         outcomes = [e.succeeded for trial, e in results if trial.world == world]
         table.add_row(
             world.engine,
