@@ -6,6 +6,7 @@ three dimensions: `set_object_physics` writes it into a context.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -25,6 +26,10 @@ NOMINAL_DENSITY: Final = 1.0  # kg/m^2
 NOMINAL_FRICTION: Final = 0.3
 NOMINAL_SUPPORT_FRICTION: Final = 0.3
 
+# The shapes an object may have, seen from above a rectangle and a circle.
+BOX: Final = "box"
+CYLINDER: Final = "cylinder"
+
 # Standard deviation over mean, of each quantity, by the paper's name of the level.
 UNCERTAINTY_LEVELS: Final = {"none": 0.0, "low": 0.1, "medium": 0.2, "high": 0.3}
 
@@ -39,7 +44,8 @@ class ObjectPhysics:
     """Physics of m objects.
 
     Attributes:
-        side_lengths: Extents along x and y of each box's own frame, shape (m, 2), m.
+        side_lengths: Extents along x and y of each object's own frame, shape (m, 2),
+            m; the diameter twice for a cylinder.
         friction: Coefficient between bodies (hand or box, and this box), shape (m,).
             Every box carries its own as both static and dynamic coefficient, the hand
             the nominal one; two bodies meet with Drake's combination of their two,
@@ -50,15 +56,23 @@ class ObjectPhysics:
             combination, and this field is not used.  Slow pushing hardly sees the
             difference: one and the same factor on all support friction changes no path.
         density: Mass per area seen from above, shape (m,), kg/m^2.
+        shapes: "box" or "cylinder", m of them; all boxes if not given.
     """
 
     side_lengths: np.ndarray
     friction: np.ndarray
     support_friction: np.ndarray
     density: np.ndarray
+    shapes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         m = len(self.side_lengths)
+        if not self.shapes:
+            object.__setattr__(self, "shapes", (BOX,) * m)
+        if len(self.shapes) != m or not set(self.shapes) <= {BOX, CYLINDER}:
+            raise InputError(
+                f"shapes must be {m} of {BOX!r} and {CYLINDER!r}, not {self.shapes}."
+            )
         shapes = {
             "side_lengths": (m, 2),
             "friction": (m,),
@@ -71,6 +85,23 @@ class ObjectPhysics:
                 raise InputError(f"{name} has shape {value.shape}, not {shape}.")
             if not (np.isfinite(value) & (value > 0)).all():
                 raise InputError(f"{name} must be positive and finite: {value}.")
+        for name, (x, y) in zip(self.shapes, self.side_lengths, strict=True):
+            if name == CYLINDER and x != y:
+                raise InputError(f"a cylinder's side lengths {x} and {y} must agree.")
+
+    def key(self) -> bytes:
+        """Equal for equal physics, for use in a dictionary."""
+        arrays = (self.side_lengths, self.friction, self.support_friction, self.density)
+        numbers = b"".join(array.tobytes() for array in arrays)
+        return numbers + ",".join(self.shapes).encode()
+
+    def inner_side_lengths(self) -> np.ndarray:
+        """Sides of rectangles that the objects contain, shape (m, 2), m.
+
+        Those of the boxes themselves, and of the squares inside cylinders.
+        """
+        is_round = np.array([shape == CYLINDER for shape in self.shapes])
+        return np.where(is_round[:, None], math.sqrt(0.5), 1.0) * self.side_lengths
 
     @property
     def num_objects(self) -> int:
@@ -158,7 +189,7 @@ def set_object_physics(
     Raises:
         InputError: If there are not as many objects as in `physics`.
     """
-    from pydrake.geometry import Box, ProximityProperties, Role, RoleAssign
+    from pydrake.geometry import Box, Cylinder, ProximityProperties, Role, RoleAssign
     from pydrake.multibody.plant import CoulombFriction
     from pydrake.multibody.tree import SpatialInertia
 
@@ -179,12 +210,15 @@ def set_object_physics(
         body = plant.get_body(index)
         x, y = physics.side_lengths[i].tolist()
         frame = plant.GetBodyFrameIdOrThrow(index)
-        height = None
+        round_one = physics.shapes[i] == CYLINDER
+        (collision, *_) = inspector.GetGeometries(frame, Role.kProximity)
+        shape = inspector.GetShape(collision)
+        height = shape.length() if isinstance(shape, Cylinder) else shape.height()
+        new_shape = Cylinder(x / 2, height) if round_one else Box(x, y, height)
         for role in (Role.kProximity, Role.kIllustration, Role.kPerception):
             for geometry in inspector.GetGeometries(frame, role):
-                height = inspector.GetShape(geometry).height()
                 scene_graph.ChangeShape(
-                    scene_graph_context, source, geometry, Box(x, y, height)
+                    scene_graph_context, source, geometry, new_shape
                 )
         coefficient = float(physics.friction[i])
         for geometry in inspector.GetGeometries(frame, Role.kProximity):
@@ -197,10 +231,14 @@ def set_object_physics(
             scene_graph.AssignRole(
                 scene_graph_context, source, geometry, properties, RoleAssign.kReplace
             )
-        mass = body.default_mass() * x * y * physics.density[i] / nominal_area_density
+        area = math.pi * x**2 / 4 if round_one else x * y
+        density = float(physics.density[i])
+        mass = body.default_mass() * area * density / nominal_area_density
         body.SetSpatialInertiaInBodyFrame(
             plant_context,
-            SpatialInertia.SolidBoxWithMass(float(mass), x, y, height),
+            SpatialInertia.SolidCylinderWithMass(mass, x / 2, height, [0.0, 0.0, 1.0])
+            if round_one
+            else SpatialInertia.SolidBoxWithMass(mass, x, y, height),
         )
 
 

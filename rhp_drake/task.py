@@ -60,7 +60,7 @@ _CLEARANCE: Final = 0.005
 
 
 class Action(enum.IntEnum):
-    """The six actions: four translations along the hand's axes, two rotations."""
+    """Translations along the axes of the hand H or of the world W, and rotations."""
 
     FORWARD = 0
     BACKWARD = 1
@@ -68,12 +68,22 @@ class Action(enum.IntEnum):
     RIGHT = 3
     COUNTERCLOCKWISE = 4
     CLOCKWISE = 5
+    WORLD_PLUS_X = 6
+    WORLD_MINUS_X = 7
+    WORLD_PLUS_Y = 8
+    WORLD_MINUS_Y = 9
 
 
-NUM_ACTIONS: Final = len(Action)
+# The paper's six actions are four translations in "the cardinal directions" and two
+# rotations.  It does not say whose directions: a policy uses one of these sets.  The
+# hand's are the default, since plans are found sooner with them (README).
+HAND_ACTIONS: Final = np.array([0, 1, 2, 3, 4, 5])
+WORLD_ACTIONS: Final = np.array([6, 7, 8, 9, 4, 5])
+NUM_ACTIONS: Final = 6
 
-# Displacement (x, y, theta) of the hand by each action, in its own frame H.
-ACTION_DISPLACEMENTS: Final = np.array(
+_FIRST_WORLD_ACTION: Final = int(Action.WORLD_PLUS_X)
+# Displacement (x, y, theta) of the hand by each action, along the axes it is named for.
+_DISPLACEMENTS: Final = np.array(
     [
         [TRANSLATION, 0, 0],
         [-TRANSLATION, 0, 0],
@@ -81,6 +91,10 @@ ACTION_DISPLACEMENTS: Final = np.array(
         [0, -TRANSLATION, 0],
         [0, 0, ROTATION],
         [0, 0, -ROTATION],
+        [TRANSLATION, 0, 0],
+        [-TRANSLATION, 0, 0],
+        [0, TRANSLATION, 0],
+        [0, -TRANSLATION, 0],
     ]
 )
 
@@ -145,9 +159,11 @@ def hand_targets(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         states: Shape (..., 3 + 3 m), or (..., 3) for the hand's pose alone.
         actions: Integers of shape (...).
     """
-    d = ACTION_DISPLACEMENTS[actions]
+    d = _DISPLACEMENTS[actions]
     x, y, theta = states[..., 0], states[..., 1], states[..., 2]
-    c, s = np.cos(theta), np.sin(theta)
+    along_hand = np.asarray(actions) < _FIRST_WORLD_ACTION
+    c = np.where(along_hand, np.cos(theta), 1.0)
+    s = np.where(along_hand, np.sin(theta), 0.0)
     return np.stack(
         [
             x + c * d[..., 0] - s * d[..., 1],
@@ -158,12 +174,18 @@ def hand_targets(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
     )
 
 
-def allowed_actions(states: np.ndarray) -> np.ndarray:
-    """Which actions keep the hand in the workspace, booleans of shape (..., 6).
+def allowed_actions(
+    states: np.ndarray, action_set: np.ndarray = HAND_ACTIONS
+) -> np.ndarray:
+    """Which actions keep the hand in the workspace, booleans of shape (..., A).
 
     Roll-outs, learning and execution all take their mask from here.
+
+    Args:
+        states: Shape (..., 3 + 3 m).
+        action_set: The A actions to look at, integers of shape (A,).
     """
-    targets = hand_targets(states[..., None, :3], np.arange(NUM_ACTIONS))
+    targets = hand_targets(states[..., None, :3], action_set)
     inside = (targets[..., :2] >= WORKSPACE_LOWER - _BORDER_TOLERANCE) & (
         targets[..., :2] <= WORKSPACE_UPPER + _BORDER_TOLERANCE
     )

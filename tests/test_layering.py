@@ -30,6 +30,7 @@ LAYERS = (
     {"scenario"},
     {"closed_loop"},
     {"evaluation", "run_record"},
+    {"benchmarks"},
     {"commands"},
     {"cli"},
 )

@@ -32,7 +32,8 @@ PHYSICS = ObjectPhysics(
 
 
 def as_vector(physics: ObjectPhysics) -> np.ndarray:
-    return np.concatenate([np.ravel(x) for x in dataclasses.astuple(physics)])
+    *arrays, _ = dataclasses.astuple(physics)
+    return np.concatenate([np.ravel(x) for x in arrays])
 
 
 def test_no_uncertainty_is_nominal():

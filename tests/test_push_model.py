@@ -1,9 +1,13 @@
 """The push model: against finer physics, against what is exact, and its bits."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from rhp_drake.physics import draw_physics, nominal_physics
 from rhp_drake.planar_geometry import rectangles_overlap
+from rhp_drake.push_model.diagram import limit_surface_length
 from rhp_drake.push_model.transition import (
     STEPS_PER_ACTION,
     PushModel,
@@ -11,6 +15,7 @@ from rhp_drake.push_model.transition import (
 )
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
+    BOX_SIDE,
     HAND_RECTANGLES,
     NUM_ACTIONS,
     Action,
@@ -125,7 +130,8 @@ def test_bits_do_not_depend_on_batch_order_or_threads(push_model, pairs):
 def test_what_is_not_touched_needs_no_physics(push_model, pairs):
     """The swept test never misses a touch that the physics would see."""
     states, actions = pairs
-    touches = first_touches(states, actions)
+    sides = np.full((len(states), 3, 2), BOX_SIDE)
+    touches = first_touches(states, actions, sides)
     free = touches == STEPS_PER_ACTION
     assert 0 < free.sum() < len(free)
     fractions = np.linspace(0, 1, 101)
@@ -154,11 +160,92 @@ def test_mirror_image_of_a_push(push_model, pairs):
 @pytest.mark.parametrize(
     ("states", "actions", "message"),
     [
-        (np.zeros((2, 9)), np.zeros(2, int), r"shape \(N, 12\)"),
+        (np.zeros((2, 10)), np.zeros(2, int), r"shape \(N, 3 \+ 3 m\)"),
+        (np.zeros((2, 15)), np.zeros(2, int), "4 objects in a push model of 3"),
         (np.zeros((2, 12)), np.zeros(3, int), "as many actions"),
         (np.full((2, 12), np.nan), np.zeros(2, int), "state 0 .* not finite"),
+        (np.stack([CAGED, CAGED * 0]), np.zeros(2, int), "state 1 .* inside each"),
     ],
 )
 def test_bad_batches_are_refused(push_model, states, actions, message):
     with pytest.raises(ValueError, match=message):
         push_model.step(states, actions)
+
+
+def test_physics_of_the_wrong_size_are_refused(push_model):
+    states, actions = CAGED[None], np.array([Action.FORWARD])
+    with pytest.raises(ValueError, match=r"physics 0 .* 2 objects"):
+        push_model.step(states, actions, nominal_physics(2))
+    with pytest.raises(ValueError, match="as many physics"):
+        push_model.step(states, actions, [nominal_physics(3)] * 2)
+
+
+def test_a_batch_may_mix_physics(push_model, pairs):
+    states, actions = pairs
+    generator = stream(0, "physics")
+    physics = [draw_physics("high", state, generator) for state in states]
+    mixed = push_model.step(states, actions, physics)
+    alone = [
+        PushModel(3).step(states[i : i + 1], actions[i : i + 1], physics[i])[0]
+        for i in range(0, len(states), 10)
+    ]
+    np.testing.assert_array_equal(mixed[::10], alone)
+    with PushModel(3, num_threads=2) as threaded:
+        np.testing.assert_array_equal(threaded.step(states, actions, physics), mixed)
+    nominal = push_model.step(states, actions, [nominal_physics(3)] * len(states))
+    np.testing.assert_array_equal(nominal, push_model.step(states, actions))
+    assert (mixed != nominal).any()
+
+
+def test_fewer_objects_need_no_other_model(pairs):
+    states, actions = pairs
+    two = np.ascontiguousarray(states[:, :9])
+    np.testing.assert_array_equal(
+        PushModel(5).step(two, actions), PushModel(2).step(two, actions)
+    )
+
+
+def test_a_wide_box_is_pushed_by_its_side(push_model):
+    physics = nominal_physics(3)
+    physics.side_lengths[0] = [0.04, 0.09]
+    after = push_model.step(CAGED[None], np.array([Action.FORWARD]), physics)[0]
+    # The palm is 2 cm behind the box: of 5 cm, 3 push.
+    np.testing.assert_allclose(after[3:5], [0.53, 0.0], atol=4e-3)
+
+
+def test_a_cylinder_is_pushed_by_its_radius(push_model):
+    physics = replace(nominal_physics(3), shapes=("cylinder", "box", "box"))
+    after = push_model.step(CAGED[None], np.array([Action.FORWARD]), physics)[0]
+    np.testing.assert_allclose(after[3:5], [0.54, 0.0], atol=1e-3)
+    # Where a turned box's corner would be hit, a cylinder is not.
+    state = CAGED.copy()
+    state[:3] = [0.5, -0.106, 0.0]
+    state[5] = np.pi / 4
+    action = np.array([Action.FORWARD])
+    box, cylinder = (
+        push_model.step(state[None], action, of)[0] for of in (None, physics)
+    )
+    assert np.linalg.norm(box[3:5] - state[3:5]) > 1e-3
+    np.testing.assert_allclose(cylinder[3:5], state[3:5], atol=1e-6)
+
+
+@pytest.mark.parametrize("quantity", ["density", "support_friction"])
+def test_the_heavier_or_rougher_box_resists_more(push_model, quantity):
+    """A box that meets another one off its centre slides aside, the more so the more
+    the other one resists."""
+    state = CAGED.copy()
+    state[6:9] = [0.561, 0.035, 0.0]
+    asides = []
+    for factor in (0.25, 1.0, 4.0):
+        physics = nominal_physics(3)
+        getattr(physics, quantity)[1] *= factor
+        after = push_model.step(state[None], np.array([Action.FORWARD]), physics)[0]
+        asides.append(state[4] - after[4])
+    assert asides[0] < asides[1] < asides[2]
+
+
+def test_limit_surface_of_a_rectangle():
+    for x, y in [(0.06, 0.06), (0.03, 0.09)]:
+        grid = (np.arange(400) + 0.5) / 400 - 0.5
+        mean = np.hypot(*np.meshgrid(x * grid, y * grid)).mean()
+        assert limit_surface_length(x, y) == pytest.approx(mean, rel=1e-5)

@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rhp_drake.commands.bench_push_model import push_model
+
 # Drake is imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,6 +20,9 @@ bench = typer.Typer(no_args_is_help=True, help="Measures parts of the project.")
 @bench.callback()
 def _bench() -> None:
     """Makes `bench` a group, even of one command."""
+
+
+bench.command()(push_model)
 
 
 @bench.command()

@@ -2,13 +2,21 @@
 
 from dataclasses import dataclass, field
 import time
+from typing import Protocol
 
 import numpy as np
 
 from rhp_drake.planning.policy import Policy, PolicyError
-from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import MAX_ACTIONS, TaskInstance, goals_reached, objects_fallen
+
+
+class PlanarWorld(Protocol):
+    """Whatever executes actions as the push model does, e.g. a `PushModel`."""
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """The states (N, 3 + 3 m) after the actions (N,)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -37,7 +45,7 @@ class Episode:
 
 
 def run_episode(
-    world: PushModel, policy: Policy, instance: TaskInstance, seed: int, index: int
+    world: PlanarWorld, policy: Policy, instance: TaskInstance, seed: int, index: int
 ) -> Episode:
     """Runs a policy on an instance until it ends (section VII of the paper).
 

@@ -15,6 +15,7 @@ from rhp_drake.random_streams import VALIDATION, stream
 from rhp_drake.scenario import Scenario
 from rhp_drake.systems.receding_horizon_planner import Status
 from rhp_drake.task import (
+    HAND_ACTIONS,
     NUM_ACTIONS,
     WORKSPACE_LOWER,
     WORKSPACE_UPPER,
@@ -127,7 +128,7 @@ def compare_pushes(num_pushes: int, seed: int, num_objects: int = 3) -> Iterator
     push_model = PushModel(num_objects)
     simulators = {
         action: Simulator(MakeClosedLoop(Scenario(), _OneAction(action)))
-        for action in Action
+        for action in map(Action, HAND_ACTIONS)
     }
     for index in range(num_pushes):
         instance, action, expected = _sample_push(

@@ -18,6 +18,7 @@ from rhp_drake.planning.search import Search, SearchRecord
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
+    HAND_ACTIONS,
     NUM_ACTIONS,
     ROTATION,
     TRANSLATION,
@@ -172,6 +173,7 @@ def plan(
     *,
     max_transitions: int = 1_000_000,
     time_limit: float = float("inf"),
+    action_set: np.ndarray = HAND_ACTIONS,
 ) -> Plan:
     """Grows a tree from `state` until a goal state is in it.
 
@@ -182,6 +184,7 @@ def plan(
         generator: Draws the places that the tree grows to.
         max_transitions: Limit of simulated actions.
         time_limit: Limit of computation, s.
+        action_set: The actions to plan with.
     """
     begin = time.perf_counter()
     tree = _Tree(state, goals, generator)
@@ -202,7 +205,7 @@ def plan(
             restart_at = record.num_transitions + _RESTART
             continue
         source = tree.states[node].copy()
-        actions = np.flatnonzero(allowed_actions(source))
+        actions = action_set[allowed_actions(source, action_set)]
         children = push_model.step(np.repeat(source[None], len(actions), 0), actions)
         indices = record.add(source, actions, children, tree.transitions[node])
         found = _grow(tree, node, actions, children, indices)

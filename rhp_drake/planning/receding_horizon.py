@@ -1,12 +1,13 @@
 """RHP: the receding-horizon planner of section VI of the paper, and greedy GP."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 import numpy as np
 
 from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.task import (
+    HAND_ACTIONS,
     MAX_ACTIONS,
     REWARD,
     allowed_actions,
@@ -36,11 +37,14 @@ class ValueFunction(Protocol):
 
 
 def masked_values(
-    value_function: ValueFunction, states: np.ndarray, goals: np.ndarray
+    value_function: ValueFunction,
+    states: np.ndarray,
+    goals: np.ndarray,
+    action_set: np.ndarray = HAND_ACTIONS,
 ) -> np.ndarray:
     """q(s, a), -inf where the action is not allowed; shape (N, 6)."""
     q = value_function.values(states, goals)
-    return np.where(allowed_actions(states), q, -np.inf)
+    return np.where(allowed_actions(states, action_set), q, -np.inf)
 
 
 def sample_softmax(
@@ -78,6 +82,7 @@ class RecedingHorizon:
         horizon: h.
         temperature: tau, in units of return (one action costs one).
         discount: gamma.
+        action_set: The actions whose values the value function gives, in its order.
     """
 
     push_model: TransitionFunction
@@ -86,6 +91,7 @@ class RecedingHorizon:
     horizon: int
     temperature: float
     discount: float = 1.0
+    action_set: np.ndarray = field(default_factory=lambda: HAND_ACTIONS)
 
     def decide(
         self,
@@ -95,11 +101,12 @@ class RecedingHorizon:
         memory: Any = None,
     ) -> Decision:
         """The first action of the best roll-out; see `policy.Policy`."""
-        q = masked_values(self.value_function, state[None], goals)
+        q = self._masked_values(state[None], goals)
         if not np.isfinite(q).any():
             raise PolicyError("no action keeps the hand in the workspace.")
         if self.horizon == 0:
-            return Decision(int(q[0].argmax()), float(q[0].max()))
+            best = int(q[0].argmax())
+            return Decision(int(self.action_set[best]), float(q[0, best]))
 
         n = self.num_roll_outs
         states = np.repeat(state[None], n, axis=0)
@@ -109,7 +116,8 @@ class RecedingHorizon:
         alive = np.ones(n, dtype=bool)
         first_actions = np.zeros(n, dtype=int)
         for depth in range(self.horizon):
-            actions = sample_softmax(q, self.temperature, generator)
+            choices = sample_softmax(q, self.temperature, generator)
+            actions = self.action_set[choices]
             if depth == 0:
                 first_actions = actions
             states = states.copy()
@@ -121,7 +129,7 @@ class RecedingHorizon:
             alive &= ~fallen & ~goals_reached(states, goals)
             if not alive.any():
                 break
-            q = masked_values(self.value_function, states, goals)
+            q = self._masked_values(states, goals)
         if alive.any():
             returns[alive] += self.discount**self.horizon * q[alive].max(axis=1)
         best = int(returns.argmax())
@@ -131,6 +139,9 @@ class RecedingHorizon:
             np.stack(path, axis=1),
             returns,
         )
+
+    def _masked_values(self, states: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        return masked_values(self.value_function, states, goals, self.action_set)
 
     def _step_distinct(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The push model's step, in which equal pairs are simulated once."""

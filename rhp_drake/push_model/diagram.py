@@ -7,6 +7,7 @@ and the ratio of angular to linear damping is that of the box's ellipsoidal limi
 surface (Goyal, Ruina and Papadopoulos 1991).
 """
 
+import math
 from typing import Final
 
 import numpy as np
@@ -22,6 +23,12 @@ from pydrake.multibody.tree import FixedOffsetFrame, PlanarJoint, SpatialInertia
 from pydrake.planning import RobotDiagram, RobotDiagramBuilder
 from pydrake.systems.framework import Context
 
+from rhp_drake.physics import (
+    CYLINDER,
+    NOMINAL_SUPPORT_FRICTION,
+    ObjectPhysics,
+    set_object_physics,
+)
 from rhp_drake.resources import make_package_map
 from rhp_drake.task import BOX_SIDE
 
@@ -35,9 +42,8 @@ _STOPPING_TIME: Final = 0.01
 # s: how fast an overlap is pushed out.  Drake's default of 0.1 s is as long as two time
 # steps: the palm would sink 1 cm into a box at a push.
 _RELAXATION_TIME: Final = 0.005
-# Largest frictional torque over largest frictional force under a uniformly loaded
-# square of side 1: the mean distance of its points from its centre.
-_LIMIT_SURFACE_LENGTH: Final = 0.3826
+# m: where a body that takes no part is parked; they stand this far apart.
+_PARKING_PLACE: Final = 10.0
 
 
 def MakePushDiagram(num_objects: int, time_step: float = TIME_STEP) -> RobotDiagram:
@@ -46,7 +52,7 @@ def MakePushDiagram(num_objects: int, time_step: float = TIME_STEP) -> RobotDiag
     The plant's positions are ordered as a task state: hand, then objects.
 
     Args:
-        num_objects: m.
+        num_objects: The largest m; a context may park some (`MakePushContext`).
         time_step: Of the contact solver, s; finer for a reference.
     """
     builder = RobotDiagramBuilder(time_step=time_step)
@@ -69,7 +75,6 @@ def MakePushDiagram(num_objects: int, time_step: float = TIME_STEP) -> RobotDiag
 
     parser = Parser(plant)
     parser.package_map().AddMap(make_package_map())
-    parser.SetAutoRenaming(True)
     parser.AddModels(url="package://rhp_drake/hand/hand.sdf")
     plant.AddJoint(
         PlanarJoint("hand", plant.world_frame(), plant.GetFrameByName("hand"))
@@ -79,29 +84,70 @@ def MakePushDiagram(num_objects: int, time_step: float = TIME_STEP) -> RobotDiag
             "box_plane", plant.world_frame(), RigidTransform([0, 0, BOX_SIDE / 2])
         )
     )
+    parser.SetAutoRenaming(True)
     for i in range(num_objects):
         (model,) = parser.AddModels(url="package://rhp_drake/box/box.sdf")
+        plant.RenameModelInstance(model, _object_name(i))
         body = plant.GetBodyByName("box", model)
-        damping = body.default_mass() / _STOPPING_TIME
-        angular_damping = damping * (_LIMIT_SURFACE_LENGTH * BOX_SIDE) ** 2
-        plant.AddJoint(
-            PlanarJoint(
-                f"object_{i}",
-                box_plane,
-                body.body_frame(),
-                [damping, damping, angular_damping],
-            )
-        )
+        plant.AddJoint(PlanarJoint(_object_name(i), box_plane, body.body_frame()))
     plant.Finalize()
     return builder.Build()
 
 
-def MakePushContext(diagram: RobotDiagram) -> Context:
-    """A root context of the push diagram, with the hand as heavy as it must be."""
+def _object_name(index: int) -> str:
+    return f"object_{index}"
+
+
+def MakePushContext(diagram: RobotDiagram, physics: ObjectPhysics) -> Context:
+    """A root context of the push diagram for so many objects of such physics.
+
+    Objects that the diagram has and `physics` has not are parked far away and locked,
+    so that the solver does not see them.
+    """
     context = diagram.CreateDefaultContext()
     plant: MultibodyPlant = diagram.plant()
+    scene_graph = diagram.scene_graph()
+    plant_context = plant.GetMyMutableContextFromRoot(context)
     plant.GetBodyByName("hand").SetSpatialInertiaInBodyFrame(
-        plant.GetMyMutableContextFromRoot(context),
-        SpatialInertia.SolidBoxWithMass(_HAND_MASS, 1.0, 1.0, 1.0),
+        plant_context, SpatialInertia.SolidBoxWithMass(_HAND_MASS, 1.0, 1.0, 1.0)
     )
+    set_object_physics(
+        physics,
+        [_object_name(i) for i in range(physics.num_objects)],
+        plant=plant,
+        plant_context=plant_context,
+        scene_graph=scene_graph,
+        scene_graph_context=scene_graph.GetMyMutableContextFromRoot(context),
+    )
+    for i in range(diagram.plant().num_joints() - 1):
+        joint = plant.GetJointByName(_object_name(i))
+        if i >= physics.num_objects:
+            joint.set_translation(plant_context, [_PARKING_PLACE * (1 + i), 0.0])
+            joint.Lock(plant_context)
+            continue
+        mass = joint.child_body().get_mass(plant_context)
+        roughness = float(physics.support_friction[i]) / NOMINAL_SUPPORT_FRICTION
+        damping = roughness * mass / _STOPPING_TIME
+        x, y = physics.side_lengths[i]
+        # Of a disc, the mean distance of its points from its centre is 2/3 radius.
+        length = x / 3 if physics.shapes[i] == CYLINDER else limit_surface_length(x, y)
+        joint.SetDampingVector(plant_context, [damping, damping, damping * length**2])
     return context
+
+
+def limit_surface_length(x: float, y: float) -> float:
+    """Largest frictional torque over largest frictional force of a support, m.
+
+    Under a load spread evenly over a rectangle this is the mean distance of its points
+    from its centre, 0.3826 sides for a square (Goyal, Ruina and Papadopoulos 1991).
+
+    Args:
+        x: One side, m.
+        y: The other, m.
+    """
+    diagonal = math.hypot(x, y)
+    return (
+        diagonal / 6
+        + x**2 / (12 * y) * math.asinh(y / x)
+        + y**2 / (12 * x) * math.asinh(x / y)
+    )

@@ -5,6 +5,7 @@ target.  Until it first touches an object nothing else moves, so an action is
 simulated from just before the first touch on, and not at all if nothing is touched.
 """
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Final
@@ -12,13 +13,11 @@ from typing import Final
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from rhp_drake.physics import ObjectPhysics, nominal_physics
 from rhp_drake.planar_geometry import rectangles_overlap
 from rhp_drake.push_model.diagram import TIME_STEP, MakePushContext, MakePushDiagram
 from rhp_drake.task import (
-    ACTION_DISPLACEMENTS,
-    BOX_SIDE,
     HAND_RECTANGLES,
-    NUM_ACTIONS,
     hand_targets,
 )
 
@@ -27,6 +26,19 @@ STEPS_PER_ACTION: Final = 10
 # Time steps in which the hand stands at its target: contact is found at the beginning
 # of a step, so the last one of the motion may leave an overlap.
 _SETTLING_STEPS: Final = 1
+# Each with its own physics.
+_SIMULATORS_PER_THREAD: Final = 32
+# m: bodies this far inside each other were put there.  Pushed ones stay below 1 cm,
+# which it takes two boxes jammed between the fingers to reach.
+_DEEP_OVERLAP: Final = 0.02
+# The hand's rectangles as `planar_geometry` wants them, in H.
+_HAND_IN_H: Final = np.insert(HAND_RECTANGLES, 2, 0.0, axis=1)
+# Where the pieces of a path have their middles, and how far each of the hand's
+# rectangles reaches from H, m.
+_MIDWAY: Final = (np.arange(STEPS_PER_ACTION) + 0.5) / STEPS_PER_ACTION
+_REACH: Final = np.linalg.norm(
+    np.abs(HAND_RECTANGLES[:, :2]) + HAND_RECTANGLES[:, 2:], axis=1
+)
 # m: what two bodies at rest in contact may overlap, an error of the contact solver.
 _CONTACT_TOLERANCE: Final = 2e-4
 
@@ -35,66 +47,70 @@ class PushModelError(RuntimeError):
     """The physics of one transition failed; the message names its state."""
 
 
-def _swept_rectangles() -> np.ndarray:
-    """What each piece of each action's path sweeps, in the frame H of its start.
+def _swept_rectangles(motions: np.ndarray) -> np.ndarray:
+    """Rectangles that cover what the hand sweeps in each piece of its path.
+
+    Args:
+        motions: Displacements of the hand in the frame H of its start, shape (N, 3).
 
     Returns:
-        Shape (6, STEPS_PER_ACTION, 3, 5): rectangles of `planar_geometry` that
-        cover the hand's three during that piece.
+        Rectangles of `planar_geometry` in that frame, shape
+        (N, STEPS_PER_ACTION, 3, 5).
     """
-    half_step = 0.5 / STEPS_PER_ACTION
-    fractions = np.arange(STEPS_PER_ACTION) / STEPS_PER_ACTION + half_step
-    swept = np.empty((NUM_ACTIONS, STEPS_PER_ACTION, len(HAND_RECTANGLES), 5))
-    radius = np.linalg.norm(
-        np.abs(HAND_RECTANGLES[:, :2]) + HAND_RECTANGLES[:, 2:], axis=1
-    )
-    for action, displacement in enumerate(ACTION_DISPLACEMENTS):
-        for i, fraction in enumerate(fractions):
-            x, y, theta = fraction * displacement
-            c, s = np.cos(theta), np.sin(theta)
-            hand = HAND_RECTANGLES
-            swept[action, i, :, 0] = x + c * hand[:, 0] - s * hand[:, 1]
-            swept[action, i, :, 1] = y + s * hand[:, 0] + c * hand[:, 1]
-            swept[action, i, :, 2] = theta
-            # A translation along an own axis sweeps just a longer rectangle; in a
-            # rotation no point strays from its midway place by more than its arc.
-            growth = np.abs(half_step * displacement)
-            swept[action, i, :, 3] = hand[:, 2] + growth[0] + growth[2] * radius
-            swept[action, i, :, 4] = hand[:, 3] + growth[1] + growth[2] * radius
-    return swept
+    x, y, theta = np.moveaxis(_MIDWAY[:, None, None] * motions, -1, 0)[..., None]
+    c, s = np.cos(theta), np.sin(theta)
+    hand = HAND_RECTANGLES.T[:, None, None, :]
+    swept = np.empty((STEPS_PER_ACTION, len(motions), len(HAND_RECTANGLES), 5))
+    swept[..., 0] = x + c * hand[0] - s * hand[1]
+    swept[..., 1] = y + s * hand[0] + c * hand[1]
+    swept[..., 2] = theta
+    # Half a piece before and after the middle of the piece; in a rotation no point
+    # strays from there by more than its arc.
+    growth = np.abs(motions) / (2 * STEPS_PER_ACTION)
+    turn = growth[:, 2:] * _REACH
+    # A translation oblique to the hand's axes is covered with some room to spare.
+    swept[..., 3] = hand[2] + growth[:, :1] + turn
+    swept[..., 4] = hand[3] + growth[:, 1:2] + turn
+    return np.moveaxis(swept, 0, 1)
 
 
-_SWEPT_RECTANGLES: Final = _swept_rectangles()
-
-
-def first_touches(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def first_touches(
+    states: np.ndarray, actions: np.ndarray, side_lengths: np.ndarray
+) -> np.ndarray:
     """The piece of each action's path in which the hand first touches an object.
 
     Args:
         states: Shape (N, 3 + 3 m).
         actions: Integers of shape (N,).
+        side_lengths: Of the boxes, shape (N, m, 2), m.
 
     Returns:
         Integers of shape (N,), `STEPS_PER_ACTION` where nothing is touched.
     """
     hand, objects = states[:, :3], states[:, 3:].reshape(len(states), -1, 3)
-    # Objects as squares in the frame H of the action's start, which is where the
-    # table of swept rectangles lives.
+    # All in the frame H of the action's start.
     offsets = objects[..., :2] - hand[:, None, :2]
     c, s = np.cos(hand[:, None, 2]), np.sin(hand[:, None, 2])
-    half = np.full(objects.shape[:2], BOX_SIDE / 2 - _CONTACT_TOLERANCE)
-    squares = np.stack(
+    boxes = np.concatenate(
         [
-            c * offsets[..., 0] + s * offsets[..., 1],
-            c * offsets[..., 1] - s * offsets[..., 0],
-            objects[..., 2] - hand[:, None, 2],
-            half,
-            half,
+            (c * offsets[..., 0] + s * offsets[..., 1])[..., None],
+            (c * offsets[..., 1] - s * offsets[..., 0])[..., None],
+            (objects[..., 2] - hand[:, None, 2])[..., None],
+            side_lengths / 2 - _CONTACT_TOLERANCE,
         ],
         axis=-1,
     )
+    motions = hand_targets(states, actions) - hand
+    c, s = c[:, 0], s[:, 0]
+    motions = np.column_stack(
+        [
+            c * motions[:, 0] + s * motions[:, 1],
+            c * motions[:, 1] - s * motions[:, 0],
+            motions[:, 2],
+        ]
+    )
     overlaps = rectangles_overlap(
-        _SWEPT_RECTANGLES[actions][:, :, :, None], squares[:, None, None]
+        _swept_rectangles(motions)[:, :, :, None], boxes[:, None, None]
     )
     touched = np.any(overlaps, axis=(2, 3))
     return np.where(touched.any(axis=1), touched.argmax(axis=1), STEPS_PER_ACTION)
@@ -103,12 +119,12 @@ def first_touches(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
 class PushModel:
     """Steps batches of (state, action) pairs.
 
-    Each thread owns a clone of one context, made once; a transition depends on its
-    own state and action alone, so results are the same bits whatever the batch and
-    the number of threads.
+    Each thread owns a simulator for each of the latest physics it met, on a clone of
+    one context; a transition depends on its own state, action and physics alone, so
+    results are the same bits whatever the batch and the number of threads.
 
     Args:
-        num_objects: m.
+        num_objects: The largest m that it can step.
         num_threads: C++ threads to spread a batch over.
         refinement: Time steps for each piece of a path; 1 is the push model, more
             is a finer reference.
@@ -122,9 +138,8 @@ class PushModel:
         self._time_step = TIME_STEP / refinement
         self.diagram = MakePushDiagram(num_objects, self._time_step)
         self._plant = self.diagram.plant()
-        context = MakePushContext(self.diagram)
-        self._simulators = [
-            Simulator(self.diagram, context.Clone()) for _ in range(num_threads)
+        self._simulators: list[dict[bytes, Simulator]] = [
+            {} for _ in range(num_threads)
         ]
         self._threads = ThreadPoolExecutor(num_threads) if num_threads > 1 else None
 
@@ -140,91 +155,106 @@ class PushModel:
         if self._threads is not None:
             self._threads.shutdown()
 
-    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    def step(
+        self,
+        states: np.ndarray,
+        actions: np.ndarray,
+        physics: ObjectPhysics | Sequence[ObjectPhysics] | None = None,
+    ) -> np.ndarray:
         """The states in which everything rests after the actions.
 
         Args:
-            states: Shape (N, 3 + 3 m).
+            states: Shape (N, 3 + 3 m), of any m up to `num_objects`.
             actions: Integers of shape (N,).
+            physics: Of the objects, for all states or for each; nominal if None.
 
         Returns:
             The next states, shape (N, 3 + 3 m).
 
         Raises:
-            ValueError: If a shape is wrong or a state is not finite.
+            ValueError: If a shape is wrong, or a state is not finite or has bodies deep
+                inside each other; the message names the state's place in the batch.
             PushModelError: If the contact solver fails.
         """
-        self._check(states, actions)
+        each = _physics_of_each(states, physics)
+        side_lengths = np.array([p.side_lengths for p in each])
+        self._check(states, actions, each)
         results = states.copy()
         results[:, :3] = hand_targets(states, actions)
-        touches = first_touches(states, actions)
+        touches = first_touches(states, actions, side_lengths)
         columns = np.flatnonzero(touches < STEPS_PER_ACTION)
-        if self._threads is None or len(columns) < 2:
-            self._simulate(self._simulators[0], columns, states, touches, results)
-        else:
+
+        def simulate(thread: int) -> None:
             # Interleaved, so that each thread gets its share of the long ones.
-            share = len(self._simulators)
-            jobs = [
-                self._threads.submit(
-                    self._simulate,
-                    simulator,
-                    columns[i::share],
-                    states,
-                    touches,
-                    results,
+            for column in columns[thread :: len(self._simulators)]:
+                simulator = self._simulator(thread, each[column])
+                self._simulate(
+                    simulator, states[column], results[column], int(touches[column])
                 )
-                for i, simulator in enumerate(self._simulators)
-            ]
-            for job in jobs:
-                job.result()
+
+        if self._threads is None:
+            simulate(0)
+        else:
+            for _ in self._threads.map(simulate, range(len(self._simulators))):
+                pass
         return results
 
+    def _simulator(self, thread: int, physics: ObjectPhysics) -> Simulator:
+        """The thread's simulator for the physics, the least recent one replaced."""
+        simulators = self._simulators[thread]
+        key = physics.key()
+        simulator = simulators.pop(key, None)
+        if simulator is None:
+            if len(simulators) >= _SIMULATORS_PER_THREAD:
+                del simulators[next(iter(simulators))]
+            simulator = Simulator(self.diagram, MakePushContext(self.diagram, physics))
+        simulators[key] = simulator
+        return simulator
+
     def _simulate(
-        self,
-        simulator: Simulator,
-        columns: np.ndarray,
-        states: np.ndarray,
-        touches: np.ndarray,
-        results: np.ndarray,
+        self, simulator: Simulator, state: np.ndarray, result: np.ndarray, touch: int
     ) -> None:
-        """Writes the objects' poses in the given columns of `results`."""
+        """Writes the objects' poses of `result`, where the hand has arrived."""
         context = simulator.get_mutable_context()
         plant_context = self._plant.GetMyMutableContextFromRoot(context)
-        num_positions = states.shape[1]
-        start = np.zeros(2 * num_positions)
-        rest = np.zeros(num_positions)
-        duration = STEPS_PER_ACTION * TIME_STEP
-        for column in columns:
-            start[:num_positions] = states[column]
-            motion = results[column, :3] - states[column, :3]
-            start[:3] += motion * (touches[column] / STEPS_PER_ACTION)
-            start[num_positions : num_positions + 3] = motion / duration
-            steps = (STEPS_PER_ACTION - touches[column]) * self._refinement
-            try:
-                context.SetTime(0.0)
-                self._plant.SetPositionsAndVelocities(plant_context, start)
-                simulator.Initialize()
-                # Half a step less than so many periods: exactly so many updates,
-                # whatever the rounding.
-                simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
-                # The hand stands; what it still overlaps comes out.
-                self._plant.SetVelocities(plant_context, rest)
-                steps += _SETTLING_STEPS * self._refinement
-                simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
-            except (RuntimeError, SystemExit) as error:
-                # Drake's assertions arrive as SystemExit.
-                raise PushModelError(
-                    f"the push model failed from state {states[column].tolist()} "
-                    f"with the hand going to {results[column, :3].tolist()}: {error}"
-                ) from error
-            results[column, 3:] = self._plant.GetPositions(plant_context)[3:]
+        # Parked objects stand where they stand.
+        positions = self._plant.GetPositions(plant_context)
+        velocities = np.zeros(len(positions))
+        positions[: len(state)] = state
+        motion = result[:3] - state[:3]
+        positions[:3] += motion * (touch / STEPS_PER_ACTION)
+        velocities[:3] = motion / (STEPS_PER_ACTION * TIME_STEP)
+        steps = (STEPS_PER_ACTION - touch) * self._refinement
+        try:
+            context.SetTime(0.0)
+            self._plant.SetPositions(plant_context, positions)
+            self._plant.SetVelocities(plant_context, velocities)
+            simulator.Initialize()
+            # Half a step less than so many periods: exactly so many updates, whatever
+            # the rounding.
+            simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
+            # The hand stands; what it still overlaps comes out.
+            self._plant.SetVelocities(plant_context, 0 * velocities)
+            steps += _SETTLING_STEPS * self._refinement
+            simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
+        except (RuntimeError, SystemExit) as error:
+            # Drake's assertions arrive as SystemExit.
+            raise PushModelError(
+                f"the push model failed from state {state.tolist()} with the hand "
+                f"going to {result[:3].tolist()}: {error}"
+            ) from error
+        result[3:] = self._plant.GetPositions(plant_context)[3 : len(state)]
 
-    def _check(self, states: np.ndarray, actions: np.ndarray) -> None:
-        size = 3 + 3 * self.num_objects
-        if states.ndim != 2 or states.shape[1] != size:
+    def _check(
+        self,
+        states: np.ndarray,
+        actions: np.ndarray,
+        physics: Sequence[ObjectPhysics],
+    ) -> None:
+        m = states.shape[1] // 3 - 1
+        if m > self.num_objects:
             raise ValueError(
-                f"states must have shape (N, {size}) for {self.num_objects} objects, "
-                f"not {states.shape}."
+                f"states of {m} objects in a push model of {self.num_objects}."
             )
         if actions.shape != states.shape[:1]:
             raise ValueError(
@@ -233,3 +263,57 @@ class PushModel:
         bad = np.flatnonzero(~np.isfinite(states).all(axis=1))
         if len(bad):
             raise ValueError(f"state {bad[0]} of the batch is not finite.")
+        inner_sides = np.array([p.inner_side_lengths() for p in physics])
+        bad = np.flatnonzero(overlaps_deeply(states, inner_sides))
+        if len(bad):
+            raise ValueError(
+                f"state {bad[0]} of the batch has bodies deep inside each other."
+            )
+
+
+def _physics_of_each(
+    states: np.ndarray, physics: ObjectPhysics | Sequence[ObjectPhysics] | None
+) -> Sequence[ObjectPhysics]:
+    """The physics of each state, all of the states' m."""
+    if states.ndim != 2 or states.shape[1] % 3 or states.shape[1] < 6:
+        raise ValueError(f"states must have shape (N, 3 + 3 m), not {states.shape}.")
+    m = states.shape[1] // 3 - 1
+    if physics is None:
+        physics = nominal_physics(m)
+    if isinstance(physics, ObjectPhysics):
+        physics = [physics] * len(states)
+    if len(physics) != len(states):
+        raise ValueError(f"{len(states)} states need as many physics.")
+    for column, of_column in enumerate(physics):
+        if of_column.num_objects != m:
+            raise ValueError(
+                f"physics {column} of the batch is of {of_column.num_objects} objects, "
+                f"the states have {m}."
+            )
+    return physics
+
+
+def overlaps_deeply(states: np.ndarray, side_lengths: np.ndarray) -> np.ndarray:
+    """Whether bodies are further inside each other than a push could leave them.
+
+    Args:
+        states: Shape (N, 3 + 3 m).
+        side_lengths: Shape (N, m, 2).
+
+    Returns:
+        Booleans of shape (N,).
+    """
+    depth = _DEEP_OVERLAP / 2
+    objects = states[:, 3:].reshape(len(states), -1, 3)
+    boxes = np.concatenate([objects, side_lengths / 2 - depth], axis=-1)
+    hand = np.broadcast_to(_HAND_IN_H, (len(states), *_HAND_IN_H.shape)).copy()
+    c, s = np.cos(states[:, None, 2]), np.sin(states[:, None, 2])
+    x, y = _HAND_IN_H[:, 0], _HAND_IN_H[:, 1]
+    hand[..., 0] = states[:, None, 0] + c * x - s * y
+    hand[..., 1] = states[:, None, 1] + s * x + c * y
+    hand[..., 2] = states[:, None, 2]
+    hand[..., 3:] -= depth
+    with_hand = rectangles_overlap(hand[:, :, None], boxes[:, None])
+    first, second = np.triu_indices(boxes.shape[1], 1)
+    with_boxes = rectangles_overlap(boxes[:, first], boxes[:, second])
+    return np.any(with_hand, axis=(1, 2)) | np.any(with_boxes, axis=1)

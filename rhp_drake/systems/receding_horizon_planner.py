@@ -266,7 +266,7 @@ class RecedingHorizonPlanner(LeafSystem):
         except PolicyError as failure:
             return episode.ended(Status.POLICY_FAILED, str(failure))
         milliseconds = 1000 * (time.perf_counter() - start)
-        if not allowed_actions(state)[decision.action]:
+        if not allowed_actions(state, np.array([decision.action])).item():
             return episode.ended(
                 Status.POLICY_FAILED,
                 f"the policy chose {Action(decision.action).name}, which takes the "

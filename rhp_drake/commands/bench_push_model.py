@@ -1,0 +1,282 @@
+"""`rhp bench push-model`: accuracy and speed of the push model, beside others'."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rhp_drake.errors import InputError
+
+# Drake is imported in the functions, so that `rhp --help` is quick.
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from rhp_drake.benchmarks.decision import DecisionTimes
+    from rhp_drake.benchmarks.other_worlds import World, WorldTrial
+    from rhp_drake.benchmarks.push_model import Accuracy, Errors, Speed, Spread
+    from rhp_drake.evaluation.episode import Episode
+
+# Tried in turn where the user names no weights.
+_WEIGHTS = (
+    "package://rhp_drake/q_network/three_boxes.safetensors",
+    "package://rhp_drake/q_network/imitation.safetensors",
+)
+
+
+def push_model(
+    *,
+    pairs: Annotated[int, typer.Option(min=10, help="(State, action) pairs.")] = 1000,
+    decisions: Annotated[int, typer.Option(min=0, help="Of RHP-66; 0: none.")] = 200,
+    instances: Annotated[
+        int, typer.Option(min=0, help="Validation instances a world; 0: none.")
+    ] = 100,
+    weights: Annotated[
+        str | None, typer.Option(help="File of the Q-network's weights.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Processes of the closed loop.")
+    ] = 2,
+    out: Annotated[
+        Path | None, typer.Option(help="Write all numbers to this JSON file.")
+    ] = None,
+) -> None:
+    """Measures accuracy and speed of the push model, and how much they matter.
+
+    Box2D and MuJoCo are compared if they are installed: pip install 'rhp_drake[bench]'.
+    """
+    from rich.console import Console
+
+    from rhp_drake.benchmarks.engines import describe_engines
+    from rhp_drake.evaluation.statistics import describe_machine
+
+    # Before the minutes of work.
+    weights_path = _find_weights(weights) if decisions or instances else None
+    console = Console()
+    results = _measure_transitions(console, pairs, seed)
+    if decisions and weights_path:
+        results["decisions"] = _measure_decisions(console, decisions, weights_path)
+    if instances and weights_path:
+        results["closed_loop"] = _measure_closed_loop(
+            console, instances, weights_path, workers
+        )
+    results["machine"] = f"{describe_machine(workers)}, {describe_engines()}"
+    console.print(results["machine"])
+    if out is not None:
+        import json
+
+        from rhp_drake.files import write_atomically
+
+        write_atomically(out, json.dumps(results, indent=1) + "\n")
+
+
+def _find_weights(weights: str | None) -> Path:
+    from rhp_drake.resources import resolve
+
+    candidates = [resolve(uri) for uri in ([weights] if weights else _WEIGHTS)]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise InputError(
+        f"{candidates[0]}: there is no such file of weights; name one with --weights, "
+        "or do without by --decisions 0 --instances 0."
+    )
+
+
+def _measure_transitions(console: "Console", count: int, seed: int) -> dict:
+    """Accuracy and speed; prints tables and returns what goes to the JSON file."""
+    from dataclasses import asdict
+    import os
+
+    from rhp_drake.benchmarks.engines import available_engines
+    from rhp_drake.benchmarks.pairs import sample_contact_pairs, sample_mixed_pairs
+    from rhp_drake.benchmarks.push_model import (
+        measure_accuracy,
+        measure_batches,
+        measure_objects,
+        measure_threads,
+    )
+    from rhp_drake.frozen_instances import NUM_OBJECTS as M
+
+    with console.status("Drawing pairs"):
+        contact = sample_contact_pairs(count, M, seed)
+        mixed = sample_mixed_pairs(count, M, seed)
+    with console.status("Accuracy"):
+        accuracies = measure_accuracy(available_engines(), contact, M)
+    console.print(_accuracy_table(accuracies, f"{count} pairs, seed {seed}"))
+    with console.status("Speed"):
+        kinds = {"contact": contact, "mixed": mixed}
+        speeds = [
+            *measure_threads(kinds, M, sorted({1, os.cpu_count() or 1})),
+            *measure_objects(seed),
+            *measure_batches(contact, M),
+        ]
+    console.print(_speed_table(speeds))
+    return {
+        "accuracy": [asdict(a) for a in accuracies],
+        "speed": [asdict(s) for s in speeds],
+    }
+
+
+def _measure_decisions(console: "Console", count: int, weights: Path) -> list[dict]:
+    from dataclasses import asdict
+    import os
+
+    import torch
+
+    from rhp_drake.benchmarks.decision import measure_decisions
+    from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
+    from rhp_drake.random_streams import VALIDATION
+    from rhp_drake.value.q_network import load_q_network
+
+    # As in episodes: such small batches gain nothing from more.
+    torch.set_num_threads(1)
+    with console.status("Decisions"):
+        times = measure_decisions(
+            load_q_network(weights, NUM_OBJECTS),
+            load_instances(VALIDATION),
+            count,
+            sorted({1, os.cpu_count() or 1}),
+        )
+    console.print(_decision_table(times))
+    return [asdict(t) for t in times]
+
+
+def _measure_closed_loop(
+    console: "Console", count: int, weights: Path, workers: int
+) -> list[dict]:
+    from dataclasses import asdict
+
+    from rich.progress import track
+
+    from rhp_drake.benchmarks.engines import available_engines
+    from rhp_drake.benchmarks.other_worlds import run_in_worlds, worlds_of
+
+    worlds = worlds_of(available_engines())
+    results = list(
+        track(
+            run_in_worlds(worlds, weights, count, workers),
+            description="Episodes",
+            total=count * len(worlds),
+            console=console,
+        )
+    )
+    console.print(_closed_loop_table(results, worlds, f"{count} validation instances"))
+    return [asdict(trial) | asdict(episode) for trial, episode in results]
+
+
+def _accuracy_table(accuracies: "Sequence[Accuracy]", title: str) -> "Table":
+    from rich.table import Table
+
+    from rhp_drake.benchmarks.push_model import FINE
+
+    table = Table(
+        title=f"Moved boxes after one contact-rich action: {title}",
+        caption="mm: mean (95 % interval), median, 95th percentile; "
+        "ms, actions/s and ratios: median (range) of interleaved runs, one thread",
+    )
+    table.add_column("engine", no_wrap=True)
+    for heading in (
+        "steps",
+        "error against\nits own finest",
+        "distance to the push\nmodel's finest",
+        "ms an action",
+        "actions/s",
+        "time over the\npush model's",
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for i, a in enumerate(accuracies):
+        is_last = i + 1 == len(accuracies) or accuracies[i + 1].engine != a.engine
+        table.add_row(
+            a.engine,
+            f"{a.refinement} x",
+            _format_errors(a.own),
+            _format_errors(a.push_model),
+            _format_spread(a.seconds, 1e3, 3),
+            f"{1 / a.seconds.median:.0f}",
+            _format_spread(a.slowness, 1.0, 3),
+            end_section=is_last,
+        )
+    table.title = f"{table.title}; finest: {FINE} x"
+    return table
+
+
+def _speed_table(speeds: "Sequence[Speed]") -> "Table":
+    from rich.table import Table
+
+    table = Table(title="Speed of the push model")
+    table.add_column("pairs", no_wrap=True)
+    for heading in ("objects", "batch", "threads", "actions/s", "ms an action"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for s in speeds:
+        table.add_row(
+            s.pairs,
+            str(s.num_objects),
+            str(s.batch),
+            str(s.threads),
+            _format_spread(s.actions_per_second, 1.0, 0),
+            f"{1e3 / s.actions_per_second.median:.3f}",
+        )
+    return table
+
+
+def _decision_table(times: "Sequence[DecisionTimes]") -> "Table":
+    from rich.table import Table
+
+    table = Table(title=f"One decision of RHP-66, ms: {times[0].decisions} decisions")
+    for heading in (
+        "threads",
+        "p50",
+        "p95",
+        "network",
+        "contact",
+        "kinematics\nand checks",
+        "planner",
+        "transitions",
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for t in times:
+        seconds = (t.p50, t.p95, t.network, t.contact, t.kinematics, t.rest)
+        table.add_row(
+            str(t.threads), *(f"{1e3 * s:.2f}" for s in seconds), f"{t.transitions:.1f}"
+        )
+    return table
+
+
+def _closed_loop_table(
+    results: "Sequence[tuple[WorldTrial, Episode]]",
+    worlds: "Sequence[World]",
+    title: str,
+) -> "Table":
+    from rich.table import Table
+
+    from rhp_drake.evaluation.statistics import format_rate
+
+    table = Table(title=f"RHP-66, planning with the push model: {title}")
+    table.add_column("world", no_wrap=True)
+    table.add_column("steps", justify="right", no_wrap=True)
+    table.add_column("success %\n(95 % Wilson)", justify="right", no_wrap=True)
+    for world in worlds:
+        outcomes = [e.succeeded for trial, e in results if trial.world == world]
+        table.add_row(
+            world.engine,
+            f"{world.refinement} x",
+            format_rate(sum(outcomes), len(outcomes)),
+        )
+    return table
+
+
+def _format_errors(errors: "Errors") -> str:
+    mean, low, high = 1e3 * errors.mean, 1e3 * errors.low, 1e3 * errors.high
+    return (
+        f"{mean:.2f} ({low:.2f}-{high:.2f}), {1e3 * errors.median:.2f}, "
+        f"{1e3 * errors.p95:.2f}"
+    )
+
+
+def _format_spread(spread: "Spread", factor: float, digits: int) -> str:
+    median, low, high = (factor * x for x in (spread.median, spread.low, spread.high))
+    return f"{median:.{digits}f} ({low:.{digits}f}-{high:.{digits}f})"
