@@ -1,6 +1,6 @@
 """Demonstrations, imitation and fitted Q."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from rhp_drake.learning.augmentation import Symmetry
 from rhp_drake.learning.demonstrations import (
     PLANS_PER_SHARD,
     load_demonstrations,
+    make_demonstration,
     make_demonstrations,
     read_description,
 )
@@ -25,7 +26,8 @@ from rhp_drake.learning.imitation import (
     imitation_targets,
     return_of,
 )
-from rhp_drake.push_model.transition import PushModel
+from rhp_drake.planning.search import Search
+from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
     Action,
@@ -69,6 +71,26 @@ def test_a_folder_is_one_demonstrator_s(folder):
     other = PlanningDemonstrator(seed=12, num_objects=3)
     with pytest.raises(InputError, match="seed=11"):
         next(make_demonstrations(folder, PLANS_PER_SHARD, other, 1))
+
+
+@dataclass(frozen=True)
+class FailsAt:
+    """A demonstrator whose push model fails in one task."""
+
+    index: int
+
+    def demonstrate(self, index):
+        if index == self.index:
+            raise PushModelError("the solver gave up")
+        goals = np.zeros((3, 2))
+        search = Search(np.zeros((0, 12)), np.zeros(0), np.zeros((0, 12)), np.zeros(0))
+        return make_demonstration(goals, None, np.zeros((0, 12)), search)
+
+
+def test_a_failure_of_the_physics_costs_one_task(tmp_path, caplog):
+    list(make_demonstrations(tmp_path, PLANS_PER_SHARD, FailsAt(7), 1))
+    assert len(load_demonstrations([tmp_path]).goals) == PLANS_PER_SHARD - 1
+    assert "task 7 is left out: the solver gave up" in caplog.text
 
 
 def test_bad_demonstrations_are_named(tmp_path):

@@ -11,6 +11,7 @@ from rhp_drake.push_model.diagram import limit_surface_length
 from rhp_drake.push_model.transition import (
     STEPS_PER_ACTION,
     PushModel,
+    PushModelError,
     first_touches,
 )
 from rhp_drake.random_streams import stream
@@ -249,3 +250,12 @@ def test_limit_surface_of_a_rectangle():
         grid = (np.arange(400) + 0.5) / 400 - 0.5
         mean = np.hypot(*np.meshgrid(x * grid, y * grid)).mean()
         assert limit_surface_length(x, y) == pytest.approx(mean, rel=1e-5)
+
+
+def test_a_failure_of_the_solver_names_its_state(push_model, monkeypatch):
+    def fail(*arguments):
+        raise SystemExit("assertion failed")  # As pydrake reports them.
+
+    monkeypatch.setattr("rhp_drake.push_model.transition.Simulator.AdvanceTo", fail)
+    with pytest.raises(PushModelError, match=r"0\.25.*assertion failed"):
+        push_model.step(CAGED[None], np.array([Action.FORWARD]))

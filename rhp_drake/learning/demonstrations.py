@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields
 from functools import partial
 import io
 import json
+import logging
 from pathlib import Path
 import re
 from typing import Final, Protocol
@@ -23,7 +24,10 @@ import numpy as np
 from rhp_drake.errors import InputError
 from rhp_drake.files import write_atomically
 from rhp_drake.planning.search import Search
+from rhp_drake.push_model.transition import PushModelError
 from rhp_drake.workers import run_over
+
+_logger = logging.getLogger("rhp_drake")
 
 PLANS_PER_SHARD: Final = 25
 
@@ -124,13 +128,15 @@ def make_demonstration(
 
 
 def _make_shard(shard: int, folder: Path, demonstrator: Demonstrator) -> int:
+    parts = []
     first = shard * PLANS_PER_SHARD
-    demonstrations = _concatenate(
-        [
-            demonstrator.demonstrate(index)
-            for index in range(first, first + PLANS_PER_SHARD)
-        ]
-    )
+    for index in range(first, first + PLANS_PER_SHARD):
+        try:
+            parts.append(demonstrator.demonstrate(index))
+        except PushModelError as error:
+            # One state that the solver cannot handle must not stop days of work.
+            _logger.warning("task %d is left out: %s", index, error)
+    demonstrations = _concatenate(parts)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **vars(demonstrations))
     write_atomically(_shard_path(folder, shard), buffer.getvalue())

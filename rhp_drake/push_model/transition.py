@@ -5,8 +5,9 @@ target.  Until it first touches an object nothing else moves, so an action is
 simulated from just before the first touch on, and not at all if nothing is touched.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from types import TracebackType
 from typing import Final
 
@@ -177,7 +178,7 @@ class PushModel:
             PushModelError: If the contact solver fails.
         """
         each = _physics_of_each(states, physics)
-        side_lengths = np.array([p.side_lengths for p in each])
+        side_lengths = _of_each(each, lambda p: p.side_lengths)
         self._check(states, actions, each)
         results = states.copy()
         results[:, :3] = hand_targets(states, actions)
@@ -263,12 +264,27 @@ class PushModel:
         bad = np.flatnonzero(~np.isfinite(states).all(axis=1))
         if len(bad):
             raise ValueError(f"state {bad[0]} of the batch is not finite.")
-        inner_sides = np.array([p.inner_side_lengths() for p in physics])
+        inner_sides = _of_each(physics, lambda p: p.inner_side_lengths())
         bad = np.flatnonzero(overlaps_deeply(states, inner_sides))
         if len(bad):
             raise ValueError(
                 f"state {bad[0]} of the batch has bodies deep inside each other."
             )
+
+
+@cache
+def _nominal_physics(num_objects: int) -> ObjectPhysics:
+    return nominal_physics(num_objects)
+
+
+def _of_each(
+    physics: Sequence[ObjectPhysics], get: Callable[[ObjectPhysics], np.ndarray]
+) -> np.ndarray:
+    """A quantity of each physics, (m, 2) of one, as an array (N, m, 2)."""
+    if all(p is physics[0] for p in physics):
+        one = get(physics[0]) if physics else np.empty((0, 2))
+        return np.broadcast_to(one, (len(physics), *one.shape))
+    return np.array([get(p) for p in physics])
 
 
 def _physics_of_each(
@@ -279,7 +295,7 @@ def _physics_of_each(
         raise ValueError(f"states must have shape (N, 3 + 3 m), not {states.shape}.")
     m = states.shape[1] // 3 - 1
     if physics is None:
-        physics = nominal_physics(m)
+        physics = _nominal_physics(m)
     if isinstance(physics, ObjectPhysics):
         physics = [physics] * len(states)
     if len(physics) != len(states):
