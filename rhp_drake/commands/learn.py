@@ -73,7 +73,7 @@ def imitate(
     demonstrations: _Demos,
     out: _Out,
     seed: _Seed = 0,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes over the plans.")] = 200,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the plans.")] = 150,
 ) -> None:
     """Trains a Q-network on the plans alone, by the paper's Eq. 2 and 3."""
     from rich.console import Console
@@ -106,7 +106,7 @@ def fit(
     start: Annotated[Path, typer.Option(help="Weights to start from.")],
     out: _Out,
     seed: _Seed = 0,
-    steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 30_000,
+    steps: Annotated[int, typer.Option(min=1, help="Gradient steps.")] = 40_000,
 ) -> None:
     """Improves a Q-network by double Q-learning on all that the searches simulated.
 

@@ -59,7 +59,7 @@ class FittedQConfig:
     l2: float = 1e-6
     learning_rate: float = 1e-3
     batch_size: int = 1024
-    num_steps: int = 30_000
+    num_steps: int = 40_000
     target_rate: float = 0.005
 
 

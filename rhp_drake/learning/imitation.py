@@ -30,7 +30,7 @@ class ImitationConfig:
     l2: float = 1e-5
     learning_rate: float = 1e-3
     batch_size: int = 512
-    num_epochs: int = 60
+    num_epochs: int = 150
 
 
 def return_of(actions_left: torch.Tensor, discount: float) -> torch.Tensor:
