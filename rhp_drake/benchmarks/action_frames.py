@@ -1,4 +1,4 @@
-"""Which translations are the better ones: along the hand's axes, or the world's?"""
+"""Plans with translations along the hand's axes, and along the world's."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -36,7 +36,9 @@ def action_frames(
     for frame in ACTION_SETS:
         of_frame = [result for trial, result in results if trial.frame == frame]
         simulated = [result.num_transitions for result in of_frame]
-        lengths = [result.num_actions for result in of_frame if result.solved]
+        lengths: list[float] = [
+            result.num_actions for result in of_frame if result.solved
+        ]
         table.add_row(
             f"the {frame}'s axes",
             format_rate(len(lengths), len(of_frame)),

@@ -5,6 +5,7 @@ from datetime import datetime
 import json
 import logging
 import math
+import os
 from pathlib import Path
 import time
 from typing import TYPE_CHECKING, Annotated, Final
@@ -135,7 +136,9 @@ def _run(
         instance.initial_state,
         stream(scenario.seed, "world_physics"),
     )
-    policy = MakePolicy(scenario.policy, instance.num_objects)
+    policy = MakePolicy(
+        scenario.policy, instance.num_objects, num_threads=os.cpu_count() or 1
+    )
     meshcat = MakeMeshcat(scenario.visualization) if use_meshcat else None
     simulator = Simulator(MakeClosedLoop(scenario, policy, meshcat))
     if realtime:

@@ -83,8 +83,13 @@ PAPER_POLICIES: Final[dict[str, Callable[[], PolicyConfig]]] = {
 }
 
 
-def MakePolicy(config: PolicyConfig, num_objects: int) -> Policy:
+def MakePolicy(config: PolicyConfig, num_objects: int, num_threads: int = 1) -> Policy:
     """Makes the policy, with its own push model, for m = `num_objects`.
+
+    Args:
+        config: Which policy.
+        num_objects: m.
+        num_threads: Of its push model; more are faster and decide the same.
 
     Raises:
         InputError: If a value is impossible, or the weights are missing, corrupt or
@@ -98,9 +103,9 @@ def MakePolicy(config: PolicyConfig, num_objects: int) -> Policy:
 
     config.validate()
     if isinstance(config, OpenLoopConfig):
-        return OpenLoop(PushModel(num_objects), config.time_limit)
+        return OpenLoop(PushModel(num_objects, num_threads), config.time_limit)
     q_network = load_q_network(resolve(config.q_network), num_objects)
-    push_model = PushModel(num_objects)
+    push_model = PushModel(num_objects, num_threads)
     if isinstance(config, GreedyConfig):
         return RecedingHorizon(push_model, q_network, 0, 0, 1.0)
     return RecedingHorizon(
