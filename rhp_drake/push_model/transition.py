@@ -142,7 +142,7 @@ class PushModel:
         self._simulators: list[dict[bytes, Simulator]] = [
             {} for _ in range(num_threads)
         ]
-        self._threads = ThreadPoolExecutor(num_threads) if num_threads > 1 else None
+        self._threads = ThreadPoolExecutor(num_threads - 1) if num_threads > 1 else None
 
     def __enter__(self) -> "PushModel":
         return self
@@ -185,19 +185,23 @@ class PushModel:
         touches = first_touches(states, actions, side_lengths)
         columns = np.flatnonzero(touches < STEPS_PER_ACTION)
 
+        # A thread that has nothing to do is not worth waking.
+        num_threads = max(1, min(len(self._simulators), len(columns)))
+
         def simulate(thread: int) -> None:
             # Interleaved, so that each thread gets its share of the long ones.
-            for column in columns[thread :: len(self._simulators)]:
+            for column in columns[thread::num_threads]:
                 simulator = self._simulator(thread, each[column])
                 self._simulate(
                     simulator, states[column], results[column], int(touches[column])
                 )
 
-        if self._threads is None:
-            simulate(0)
-        else:
-            for _ in self._threads.map(simulate, range(len(self._simulators))):
-                pass
+        jobs = []
+        if self._threads is not None:
+            jobs = [self._threads.submit(simulate, k) for k in range(1, num_threads)]
+        simulate(0)
+        for job in jobs:
+            job.result()
         return results
 
     def _simulator(self, thread: int, physics: ObjectPhysics) -> Simulator:

@@ -47,7 +47,7 @@ class QNetwork(nn.Module):
         """Values (N, 6) for states (N, 3 + 3 m) and goals (N, m, 2)."""
         return self.layers(features(states, goals))
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def values(self, states: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Values (N, 6) for states (N, 3 + 3 m) and one task's goals (m, 2)."""
         batch = torch.as_tensor(states, dtype=torch.float32)
