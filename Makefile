@@ -3,7 +3,8 @@
 
 PYTHON ?= python3.11
 BIN := .venv/bin
-INSTALLED := .venv/installed
+# Another Python needs another set-up.
+INSTALLED := .venv/installed-$(notdir $(PYTHON))
 
 .PHONY: help demo test lint format
 
@@ -31,6 +32,6 @@ format: $(INSTALLED)
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c "" || \
 	  { echo "$(PYTHON) does not run: choose another, make PYTHON=python3.12 ..."; exit 1; }
-	$(PYTHON) -m venv .venv
+	$(PYTHON) -m venv --clear .venv
 	$(BIN)/pip install --quiet -c constraints.txt -e ".[dev]"
 	touch $@

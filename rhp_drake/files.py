@@ -20,6 +20,17 @@ def make_folder(path: Path) -> None:
         raise InputError(f"{path}: no folder can be made: {error.strerror}.") from None
 
 
+def check_writable(path: Path) -> None:
+    """Makes the folder of a file that long work will write.
+
+    Raises:
+        InputError: If it cannot be made, or the file is a folder.
+    """
+    make_folder(path.parent)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, not a file to write.")
+
+
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes under another name in the same folder, then renames.
 

@@ -164,7 +164,11 @@ def _find(path: Path) -> Path:
 def check_scenario(scenario: Scenario) -> None:
     """Raises InputError if a value of the right type is impossible all the same."""
     _check(scenario.seed >= 0, "seed", scenario.seed, "at least 0")
-    _check(scenario.time_limit > 0, "time_limit", scenario.time_limit, "positive")
+    good = 0 < scenario.time_limit < math.inf
+    _check(good, "time_limit", scenario.time_limit, "positive and finite")
+    objects = scenario.station.objects
+    distinct = len(set(objects)) == len(objects)
+    _check(distinct, "station.objects", objects, "names of different objects")
     time_step = scenario.station.plant.time_step
     _check(time_step > 0, "station.plant.time_step", time_step, "positive")
     levels = ", ".join(UNCERTAINTY_LEVELS)

@@ -42,8 +42,9 @@ HAND_RECTANGLES: Final = np.array(
 # every heading.
 WORKSPACE_LOWER: Final = np.array([0.20, -0.30])
 WORKSPACE_UPPER: Final = np.array([0.80, 0.30])
-# m: keeps the arm's small errors from masking the rotations of a hand on the border.
+# m: an arm that is not exact may be sent this far out, and may still turn this far out.
 _BORDER_TOLERANCE: Final = 0.001
+_TURNING_TOLERANCE: Final = 0.005
 # Wrist 3 turns within +-360 degrees, of which shoulder pan's part (up to 57 degrees
 # either way in this workspace) is not the hand's to use.
 MAX_HEADING: Final = math.radians(300)
@@ -76,7 +77,7 @@ class Action(enum.IntEnum):
 
 # The paper's six actions are four translations in "the cardinal directions" and two
 # rotations.  It does not say whose directions: a policy uses one of these sets.  The
-# hand's are the default, since plans are found sooner with them (README).
+# hand's are the default, since plans are shorter with them (rhp bench action-frames).
 HAND_ACTIONS: Final = np.array([0, 1, 2, 3, 4, 5])
 WORLD_ACTIONS: Final = np.array([6, 7, 8, 9, 4, 5])
 NUM_ACTIONS: Final = 6
@@ -186,8 +187,10 @@ def allowed_actions(
         action_set: The A actions to look at, integers of shape (A,).
     """
     targets = hand_targets(states[..., None, :3], action_set)
-    inside = (targets[..., :2] >= WORKSPACE_LOWER - _BORDER_TOLERANCE) & (
-        targets[..., :2] <= WORKSPACE_UPPER + _BORDER_TOLERANCE
+    turns = (_DISPLACEMENTS[action_set, :2] == 0).all(axis=-1, keepdims=True)
+    tolerance = np.where(turns, _TURNING_TOLERANCE, _BORDER_TOLERANCE)
+    inside = (targets[..., :2] >= WORKSPACE_LOWER - tolerance) & (
+        targets[..., :2] <= WORKSPACE_UPPER + tolerance
     )
     return inside.all(axis=-1) & (np.abs(targets[..., 2]) <= MAX_HEADING)
 

@@ -51,7 +51,10 @@ def test_each_command_has_help(command, monkeypatch, capsys):
         (["--count", "0"], "0 instances were asked for; the validation set has 500."),
         (["--count", "501"], "501 instances were asked for; the validation set has"),
         (["--world", "moon"], "'moon' is not a world: planar, station."),
-        (["--temperature", "0"], "policy.temperature is 0.0; it must be above 0."),
+        (
+            ["--temperature", "0"],
+            "policy.temperature is 0.0; it must be above 0 and finite.",
+        ),
         (["--weights", "missing", "--policies", "gp"], "missing: there is no such fi"),
         (["--out", "/dev/null/out.json"], "/dev/null: no folder can be made: "),
     ],

@@ -106,7 +106,7 @@ def test_guard_fault_ends_run():
 @pytest.fixture
 def rhp(monkeypatch, tmp_path):
     """Runs `rhp run` with a random policy, returns exit status and results."""
-    monkeypatch.setattr(POLICY, lambda config, num_objects: RandomPolicy())
+    monkeypatch.setattr(POLICY, lambda *args, **kwargs: RandomPolicy())
 
     def run_rhp(out, *arguments):
         options = ["--no-realtime", "--out", str(tmp_path / out)]
@@ -168,7 +168,7 @@ def test_ctrl_c_keeps_the_record(rhp, monkeypatch):
 
 
 def test_graphviz(monkeypatch, tmp_path):
-    monkeypatch.setattr(POLICY, lambda config, num_objects: RandomPolicy())
+    monkeypatch.setattr(POLICY, lambda *args, **kwargs: RandomPolicy())
     path = tmp_path / "diagram.dot"
     arguments = ["rhp", "run", "three_boxes", "--graphviz", str(path)]
     monkeypatch.setattr("sys.argv", arguments)

@@ -238,9 +238,9 @@ def test_fitting_goes_on_from_a_checkpoint_as_if_never_stopped(data, tmp_path):
     _, stopped = learner()
     for _ in range(3):
         stopped.step()
-    stopped.save(tmp_path / "checkpoint")
+    stopped.save(tmp_path / "checkpoint", {"seed": 3})
     resumed_network, resumed = learner()
-    resumed.resume(tmp_path / "checkpoint")
+    resumed.resume(tmp_path / "checkpoint", {"seed": 3})
     for _ in range(5):
         resumed.step()
     for ours, theirs in zip(
@@ -251,7 +251,9 @@ def test_fitting_goes_on_from_a_checkpoint_as_if_never_stopped(data, tmp_path):
 
     (tmp_path / "corrupt").write_bytes(b"no checkpoint")
     with pytest.raises(InputError, match="corrupt"):
-        resumed.resume(tmp_path / "corrupt")
+        resumed.resume(tmp_path / "corrupt", {"seed": 3})
     other = FittedQ(network, data, replace(config, discount=0.9), stream(3))
-    with pytest.raises(InputError, match="another configuration"):
-        other.resume(tmp_path / "checkpoint")
+    with pytest.raises(InputError, match="other work"):
+        other.resume(tmp_path / "checkpoint", {"seed": 3})
+    with pytest.raises(InputError, match="other work"):
+        resumed.resume(tmp_path / "checkpoint", {"seed": 4})

@@ -17,6 +17,7 @@ from rhp_drake.push_model.transition import (
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
     BOX_SIDE,
+    HAND_ACTIONS,
     HAND_RECTANGLES,
     NUM_ACTIONS,
     Action,
@@ -130,7 +131,8 @@ def test_bits_do_not_depend_on_batch_order_or_threads(push_model, pairs):
 
 def test_what_is_not_touched_needs_no_physics(push_model, pairs):
     """The swept test never misses a touch that the physics would see."""
-    states, actions = pairs
+    states, _ = pairs
+    actions = stream(2, "all_actions").integers(len(Action), size=len(states))
     sides = np.full((len(states), 3, 2), BOX_SIDE)
     touches = first_touches(states, actions, sides)
     free = touches == STEPS_PER_ACTION
@@ -166,6 +168,8 @@ def test_mirror_image_of_a_push(push_model, pairs):
         (np.zeros((2, 12)), np.zeros(3, int), "as many actions"),
         (np.full((2, 12), np.nan), np.zeros(2, int), "state 0 .* not finite"),
         (np.stack([CAGED, CAGED * 0]), np.zeros(2, int), "state 1 .* inside each"),
+        (np.stack([CAGED, CAGED]), np.array([0, -1]), "action 1 .* is -1"),
+        (np.stack([CAGED, CAGED]), np.zeros(2), "must be integers"),
     ],
 )
 def test_bad_batches_are_refused(push_model, states, actions, message):
@@ -250,6 +254,35 @@ def test_limit_surface_of_a_rectangle():
         grid = (np.arange(400) + 0.5) / 400 - 0.5
         mean = np.hypot(*np.meshgrid(x * grid, y * grid)).mean()
         assert limit_surface_length(x, y) == pytest.approx(mean, rel=1e-5)
+
+
+def test_boxes_smaller_than_believed_may_stand_closer(push_model):
+    """A planner sees boxes of 3 cm side by side, and believes that they are larger."""
+    state = CAGED.copy()
+    state[6:9] = [0.5, 0.03, 0.0]
+    after = push_model.step(state[None], np.array([Action.FORWARD]))[0]
+    assert np.isfinite(after).all()
+
+
+def test_an_empty_batch(push_model):
+    assert push_model.step(np.empty((0, 12)), np.empty(0, int)).shape == (0, 12)
+
+
+@pytest.mark.parametrize("action", HAND_ACTIONS)
+def test_a_moved_and_turned_scene_is_pushed_the_same_way(push_model, pairs, action):
+    states = pairs[0][:40]
+    turned = states.reshape(-1, 4, 3) + np.array([0, 0, np.pi / 2])
+    turned[..., 0], turned[..., 1] = 0.5 - states[:, 1::3], states[:, 0::3] - 0.5
+    turned = turned.reshape(states.shape)
+    actions = np.full(len(states), action)
+    start = object_positions(states)
+    ways = object_positions(push_model.step(states, actions)) - start
+    turned_ways = object_positions(push_model.step(turned, actions)) - object_positions(
+        turned
+    )
+    back = np.stack([turned_ways[..., 1], -turned_ways[..., 0]], axis=-1)
+    assert np.median(np.linalg.norm(back - ways, axis=-1)) < 1e-6
+    assert np.linalg.norm(back - ways, axis=-1).mean() < 1e-3
 
 
 def test_a_failure_of_the_solver_names_its_state(push_model, monkeypatch):

@@ -137,7 +137,10 @@ def test_expanded_scenario_loads_again(tmp_path):
         ("a: {policy: {horizon: x}}", ": a: policy.horizon: 'x' is not a value it ca"),
         ("a: {seed: -1}", ": a: seed: must be at least 0, not -1."),
         ("a: {station: {plant: {time_step: 0}}}", ": a: station.plant.time_step: must"),
-        ("a: {time_limit: 0}", ": a: time_limit: must be positive, not 0.0."),
+        (
+            "a: {time_limit: 0}",
+            ": a: time_limit: must be positive and finite, not 0.0.",
+        ),
         ("a: {world_physics: extreme}", ": a: world_physics: must be one of none, lo"),
         ("a: {task: {set: test}}", ": a: task.set: must be one of training, validat"),
         ("a: {task: {index: -1}}", ": a: task.index: must be at least 0, not -1."),

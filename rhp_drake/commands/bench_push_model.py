@@ -52,9 +52,12 @@ def push_model(
 
     from rhp_drake.benchmarks.engines import describe_engines
     from rhp_drake.evaluation.statistics import describe_machine
+    from rhp_drake.files import check_writable
 
     # Before the minutes of work.
     weights_path = _find_weights(weights) if decisions or instances else None
+    if out is not None:
+        check_writable(out)
     console = Console()
     results = _measure_transitions(console, pairs, seed)
     if decisions and weights_path:

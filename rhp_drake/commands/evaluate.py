@@ -39,7 +39,7 @@ def evaluate(
 
     from rhp_drake.evaluation.comparison import Comparison, make_table, run_comparison
     from rhp_drake.evaluation.statistics import describe_machine
-    from rhp_drake.files import make_folder
+    from rhp_drake.files import check_writable
 
     comparison = Comparison(
         {name: _config(name, weights, temperature) for name in policies.split(",")},
@@ -49,7 +49,7 @@ def evaluate(
         seed,
     )
     if out is not None:
-        make_folder(out.parent)
+        check_writable(out)
     console = Console()
     trials = run_comparison(comparison, workers)
     total = len(comparison.trials())

@@ -1,10 +1,13 @@
 """`rhp demos`, `rhp imitate` and `rhp fit`: from plans to a Q-network."""
 
+import hashlib
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+
+from rhp_drake.errors import InputError
 
 _VALIDATION_TASKS: Final = 200
 
@@ -16,7 +19,7 @@ _Demos = Annotated[
     list[Path], typer.Option(help="Folder of demonstrations; may be repeated.")
 ]
 _Out = Annotated[Path, typer.Option(help="File of the trained weights.")]
-_Seed = Annotated[int, typer.Option(help="Of all random draws.")]
+_Seed = Annotated[int, typer.Option(min=0, help="Of all random draws.")]
 
 
 def demos(
@@ -59,12 +62,11 @@ def demos(
         for done in make_demonstrations(out, plans, demonstrator, workers):
             progress.update(bar, completed=min(done, plans))
     data = load_demonstrations([out])
-    lengths = data.plan_actions_left[
-        [0, *(1 + (data.plan_tasks[1:] != data.plan_tasks[:-1]).nonzero()[0])]
-    ]
+    solved = int(data.solved.sum())
     console.print(
-        f"{out}: {int(data.solved.sum())} of {len(data.solved)} tasks solved, "
-        f"{lengths.mean():.1f} actions a plan, {len(data.search_actions)} transitions."
+        f"{out}: {solved} of {len(data.solved)} tasks solved, "
+        f"{len(data.plan_actions) / max(solved, 1):.1f} actions a plan, "
+        f"{len(data.search_actions)} transitions."
     )
 
 
@@ -79,14 +81,18 @@ def imitate(
     from rich.console import Console
     import torch
 
+    from rhp_drake.files import check_writable
     from rhp_drake.learning.demonstrations import load_demonstrations
     from rhp_drake.learning.imitation import ImitationConfig, imitate
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import QNetwork
 
     torch.set_flush_denormal(True)
+    check_writable(out)
     console = Console()
     data = load_demonstrations(demonstrations)
+    if not data.solved.any():
+        raise InputError("none of the demonstrations holds a plan to imitate.")
     config = ImitationConfig(num_epochs=epochs)
     torch.manual_seed(seed)
     network = QNetwork(data.goals.shape[1])
@@ -116,11 +122,16 @@ def fit(
     from rich.console import Console
     import torch
 
-    from rhp_drake.learning.demonstrations import load_demonstrations
+    from rhp_drake.files import check_writable
+    from rhp_drake.learning.demonstrations import (
+        load_demonstrations,
+        read_description,
+    )
     from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import load_q_network
 
+    check_writable(out)
     # Gradients of dead units get so small that arithmetic takes five times as long.
     torch.set_flush_denormal(True)
     console = Console()
@@ -128,9 +139,15 @@ def fit(
     network = load_q_network(start, data.goals.shape[1])
     config = FittedQConfig(num_steps=steps)
     learner = FittedQ(network, data, config, stream(seed, "fitted_q"))
+    origin = {
+        "seed": seed,
+        "start": hashlib.sha256(start.read_bytes()).hexdigest(),
+        "demonstrations": [read_description(folder) for folder in demonstrations],
+        "transitions": len(data.search_actions),
+    }
     checkpoint = out.with_name(out.name + ".checkpoint")
     if checkpoint.exists():
-        learner.resume(checkpoint)
+        learner.resume(checkpoint, origin)
         console.print(f"Goes on from step {learner.num_steps} of {checkpoint}.")
     with _progress(console) as progress:
         bar = progress.add_task("Steps", total=steps, completed=learner.num_steps)
@@ -143,7 +160,7 @@ def fit(
                     description=f"loss {learner.mean_loss:.3f}",
                 )
             if learner.num_steps % 1000 == 0:
-                learner.save(checkpoint)
+                learner.save(checkpoint, origin)
     details = vars(config) | {"loss": learner.mean_loss}
     details["start"] = network.provenance
     _save(network, out, demonstrations, data, seed, details, console)

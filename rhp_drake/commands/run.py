@@ -116,6 +116,7 @@ def _run(
     """Runs the scenario, says what happens, and writes the results to `folder`."""
     from pydrake.systems.analysis import Simulator
     from rich.console import Console
+    import torch
 
     from rhp_drake.closed_loop import MakeClosedLoop, Outcome, run_closed_loop
     from rhp_drake.files import make_folder, write_atomically
@@ -126,6 +127,8 @@ def _run(
     from rhp_drake.scenario import make_task_instance
     from rhp_drake.visualization import FRAME_PERIOD, MakeMeshcat
 
+    # As everywhere else: the same bits on machines of more cores.
+    torch.set_num_threads(1)
     # Drake announces Meshcat's address; so do we.
     logging.getLogger("drake").setLevel(logging.WARNING)
     # No markup: a message may well have brackets of its own.

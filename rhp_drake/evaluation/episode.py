@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from rhp_drake.planning.policy import Policy, PolicyError
+from rhp_drake.push_model.transition import PushModelError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import MAX_ACTIONS, TaskInstance, goals_reached, objects_fallen
 
@@ -24,8 +25,8 @@ class Episode:
     """How a run went.
 
     Attributes:
-        outcome: "succeeded", "out of actions", "object fell", "policy failed", and in
-            the station whatever else stopped it.
+        outcome: "succeeded", "out of actions", "object fell", "policy failed", "world
+            failed", and in the station whatever else stopped it.
         num_actions: Actions executed.
         decision_seconds: Computation of each decision.
         simulated_seconds: How long it took in the world; 0 where time does not flow.
@@ -65,11 +66,14 @@ def run_episode(
             decision = policy.decide(
                 state, goals, stream(seed, index, "decision", k), memory
             )
-        except PolicyError:
+        except (PolicyError, PushModelError):
             return Episode("policy failed", k, seconds)
         seconds.append(time.perf_counter() - begin)
         memory = decision.memory
-        state = world.step(state[None], np.array([decision.action]))[0]
+        try:
+            state = world.step(state[None], np.array([decision.action]))[0]
+        except PushModelError:
+            return Episode("world failed", k + 1, seconds)
         if objects_fallen(state):
             return Episode("object fell", k + 1, seconds)
         if goals_reached(state, goals):

@@ -136,6 +136,8 @@ def _make_shard(shard: int, folder: Path, demonstrator: Demonstrator) -> int:
         except PushModelError as error:
             # One state that the solver cannot handle must not stop days of work.
             _logger.warning("task %d is left out: %s", index, error)
+    if not parts:
+        raise PushModelError(f"all tasks of shard {shard} failed.")
     demonstrations = _concatenate(parts)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **vars(demonstrations))

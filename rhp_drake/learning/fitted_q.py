@@ -14,7 +14,7 @@ import io
 import json
 from pathlib import Path
 import pickle
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -118,6 +118,7 @@ def sample(
     kept = np.linalg.norm(end - of_task, axis=-1) <= GOAL_RADIUS
     kept[:, 0] = False
     found = np.where(kept[..., None], of_task, found)
+    moved &= ~objects_fallen(data.search_next_states[ends])
     goals[:num_hindsight][moved] = found[moved]
     least[:num_hindsight][moved] = REWARD * num_actions[moved]
     return Samples(
@@ -236,8 +237,13 @@ class FittedQ:
         weight = max(1 / self.num_steps, 0.001)
         self.mean_loss += weight * (loss.item() - self.mean_loss)
 
-    def save(self, path: Path) -> None:
-        """Writes a checkpoint: going on from it is as if never stopped."""
+    def save(self, path: Path, origin: dict[str, Any]) -> None:
+        """Writes a checkpoint: going on from it is as if never stopped.
+
+        Args:
+            path: The file.
+            origin: What else the work depends on: seed, data, first weights.
+        """
         buffer = io.BytesIO()
         torch.save(
             {
@@ -249,23 +255,24 @@ class FittedQ:
                 "num_steps": self.num_steps,
                 "mean_loss": self.mean_loss,
                 "config": vars(self._config),
+                "origin": json.dumps(origin),
             },
             buffer,
         )
         write_atomically(path, buffer.getvalue())
 
-    def resume(self, path: Path) -> None:
+    def resume(self, path: Path, origin: dict[str, Any]) -> None:
         """Goes on from a checkpoint of `save`.
 
         Raises:
-            InputError: If it cannot be read, or was made with another configuration.
+            InputError: If it cannot be read, or belongs to other work.
         """
         try:
             saved = torch.load(path, weights_only=True)
-            if saved["config"] != vars(self._config):
+            same = saved["config"] == vars(self._config)
+            if not same or saved["origin"] != json.dumps(origin):
                 raise InputError(
-                    f"{path}: a checkpoint of another configuration; delete it to "
-                    "start anew."
+                    f"{path}: a checkpoint of other work; delete it to start anew."
                 )
             self._network.load_state_dict(saved["network"])
             self._target.load_state_dict(saved["target"])

@@ -19,6 +19,7 @@ from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
     HAND_ACTIONS,
+    MAX_ACTIONS,
     NUM_ACTIONS,
     ROTATION,
     TRANSLATION,
@@ -119,14 +120,16 @@ class _Tree:
         self.add(state, -1, -1, -1)
 
     def add(self, state: np.ndarray, parent: int, action: int, transition: int) -> bool:
-        """Adds a node, unless the tree has nearly the same state."""
+        """Adds a node, unless it is too deep or the tree has nearly the same state."""
         size = len(self._parents)
+        depth = self._depths[parent] + 1 if parent >= 0 else 0
+        if depth > MAX_ACTIONS:
+            return False
         key = state.copy()
         key[2::3] *= _ANGLE_LENGTH
         distances = np.abs(self._keys[:size] - key).max(axis=1)
         if size and distances.min() < _DUPLICATE_DISTANCE:
             return False
-        depth = self._depths[parent] + 1 if parent >= 0 else 0
         moved = np.linalg.norm(object_positions(state)[1:] - self.goals[1:], axis=1)
         self.states[size] = state
         self._keys[size] = key
@@ -206,6 +209,10 @@ def plan(
             continue
         source = tree.states[node].copy()
         actions = action_set[allowed_actions(source, action_set)]
+        if not len(actions):
+            if node == 0:
+                break
+            continue
         children = push_model.step(np.repeat(source[None], len(actions), 0), actions)
         indices = record.add(source, actions, children, tree.transitions[node])
         found = _grow(tree, node, actions, children, indices)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+import math
 from typing import Final, TypeAlias
 
 from rhp_drake.errors import InputError
@@ -34,9 +35,10 @@ class RecedingHorizonConfig:
                 raise InputError(
                     f"policy.{name} is {getattr(self, name)}; it must be at least 1."
                 )
-        if not self.temperature > 0:
+        if not 0 < self.temperature < math.inf:
             raise InputError(
-                f"policy.temperature is {self.temperature}; it must be above 0."
+                f"policy.temperature is {self.temperature}; it must be above 0 and "
+                "finite."
             )
 
 
@@ -66,9 +68,10 @@ class OpenLoopConfig:
 
     def validate(self) -> None:
         """Raises an `InputError` if the limit is impossible."""
-        if not self.time_limit > 0:
+        if not 0 < self.time_limit < math.inf:
             raise InputError(
-                f"policy.time_limit is {self.time_limit}; it must be above 0."
+                f"policy.time_limit is {self.time_limit}; it must be above 0 and "
+                "finite."
             )
 
 

@@ -1,4 +1,4 @@
-"""The transition function T of the paper's MDP: batches of pushes on cloned contexts.
+"""The transition function T of the paper's MDP: batches of pushes, in threads.
 
 The hand's motion is prescribed: it cannot be stopped, and ends exactly at its
 target.  Until it first touches an object nothing else moves, so an action is
@@ -6,7 +6,7 @@ simulated from just before the first touch on, and not at all if nothing is touc
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from types import TracebackType
 from typing import Final
@@ -14,11 +14,13 @@ from typing import Final
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from rhp_drake.physics import ObjectPhysics, nominal_physics
+from rhp_drake.physics import SIDE_RANGE, ObjectPhysics, nominal_physics
 from rhp_drake.planar_geometry import rectangles_overlap
 from rhp_drake.push_model.diagram import TIME_STEP, MakePushContext, MakePushDiagram
 from rhp_drake.task import (
+    BOX_SIDE,
     HAND_RECTANGLES,
+    Action,
     hand_targets,
 )
 
@@ -29,9 +31,10 @@ STEPS_PER_ACTION: Final = 10
 _SETTLING_STEPS: Final = 1
 # Each with its own physics.
 _SIMULATORS_PER_THREAD: Final = 32
-# m: bodies this far inside each other were put there.  Pushed ones stay below 1 cm,
-# which it takes two boxes jammed between the fingers to reach.
-_DEEP_OVERLAP: Final = 0.02
+# m: bodies this far inside each other were put there by mistake.  Pushed ones stay
+# below 1 cm, which it takes two boxes jammed between the fingers to reach; but a
+# planner that believes in nominal boxes may see smaller ones closer than those can be.
+_DEEP_OVERLAP: Final = BOX_SIDE - SIDE_RANGE[0] + 0.005
 # The hand's rectangles as `planar_geometry` wants them, in H.
 _HAND_IN_H: Final = np.insert(HAND_RECTANGLES, 2, 0.0, axis=1)
 # Where the pieces of a path have their middles, and how far each of the hand's
@@ -44,8 +47,8 @@ _REACH: Final = np.linalg.norm(
 _CONTACT_TOLERANCE: Final = 2e-4
 
 
-class PushModelError(RuntimeError):
-    """The physics of one transition failed; the message names its state."""
+class PushModelError(ValueError):
+    """A transition cannot be computed; the message names its state."""
 
 
 def _swept_rectangles(motions: np.ndarray) -> np.ndarray:
@@ -120,13 +123,16 @@ def first_touches(
 class PushModel:
     """Steps batches of (state, action) pairs.
 
-    Each thread owns a simulator for each of the latest physics it met, on a clone of
-    one context; a transition depends on its own state, action and physics alone, so
-    results are the same bits whatever the batch and the number of threads.
+    Each thread owns a simulator, with its own context of the one diagram, for each of
+    the latest physics it met.  A transition depends on its own state, action and
+    physics alone, so results are the same bits whatever the batch and the number of
+    threads.  (Drake's batch evaluation would clone a context at every call, which costs
+    more than a transition.)
 
     Args:
         num_objects: The largest m that it can step.
-        num_threads: C++ threads to spread a batch over.
+        num_threads: Threads to spread a batch over; Drake simulates without Python's
+            lock.
         refinement: Time steps for each piece of a path; 1 is the push model, more
             is a finer reference.
     """
@@ -173,11 +179,14 @@ class PushModel:
             The next states, shape (N, 3 + 3 m).
 
         Raises:
-            ValueError: If a shape is wrong, or a state is not finite or has bodies deep
-                inside each other; the message names the state's place in the batch.
-            PushModelError: If the contact solver fails.
+            ValueError: If a shape is wrong, or an action is none.
+            PushModelError: If a state is not finite or has bodies deep inside each
+                other, or the contact solver fails; the message names the state.
         """
+        states = np.asarray(states, dtype=float)
         each = _physics_of_each(states, physics)
+        if not len(states):
+            return states.copy()
         side_lengths = _of_each(each, lambda p: p.side_lengths)
         self._check(states, actions, each)
         results = states.copy()
@@ -199,7 +208,11 @@ class PushModel:
         jobs = []
         if self._threads is not None:
             jobs = [self._threads.submit(simulate, k) for k in range(1, num_threads)]
-        simulate(0)
+        try:
+            simulate(0)
+        finally:
+            # After a failure, too: nobody else may use the simulators before.
+            wait(jobs)
         for job in jobs:
             job.result()
         return results
@@ -267,12 +280,18 @@ class PushModel:
             )
         bad = np.flatnonzero(~np.isfinite(states).all(axis=1))
         if len(bad):
-            raise ValueError(f"state {bad[0]} of the batch is not finite.")
+            raise PushModelError(f"state {bad[0]} of the batch is not finite.")
+        if not np.issubdtype(actions.dtype, np.integer):
+            raise ValueError(f"actions must be integers, not {actions.dtype}.")
+        bad = np.flatnonzero((actions < 0) | (actions >= len(Action)))
+        if len(bad):
+            raise ValueError(f"action {bad[0]} of the batch is {actions[bad[0]]}.")
         inner_sides = _of_each(physics, lambda p: p.inner_side_lengths())
         bad = np.flatnonzero(overlaps_deeply(states, inner_sides))
         if len(bad):
-            raise ValueError(
-                f"state {bad[0]} of the batch has bodies deep inside each other."
+            raise PushModelError(
+                f"state {bad[0]} of the batch, {states[bad[0]].tolist()}, has bodies "
+                "deep inside each other."
             )
 
 
@@ -286,7 +305,7 @@ def _of_each(
 ) -> np.ndarray:
     """A quantity of each physics, (m, 2) of one, as an array (N, m, 2)."""
     if all(p is physics[0] for p in physics):
-        one = get(physics[0]) if physics else np.empty((0, 2))
+        one = get(physics[0])
         return np.broadcast_to(one, (len(physics), *one.shape))
     return np.array([get(p) for p in physics])
 

@@ -11,6 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from rhp_drake.errors import InputError
 from rhp_drake.planning.policy import Decision, Policy, PolicyError
+from rhp_drake.push_model.transition import PushModelError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
     MAX_ACTIONS,
@@ -263,7 +264,7 @@ class RecedingHorizonPlanner(LeafSystem):
             decision = self._policy.decide(
                 state, goals, stream(seed, "decision", index), memory
             )
-        except PolicyError as failure:
+        except (PolicyError, PushModelError) as failure:
             return episode.ended(Status.POLICY_FAILED, str(failure))
         milliseconds = 1000 * (time.perf_counter() - start)
         if not allowed_actions(state, np.array([decision.action])).item():
