@@ -180,8 +180,8 @@ def _accuracy_table(accuracies: "Sequence[Accuracy]", title: str) -> "Table":
     # Without frames, it fits into 80 columns.
     table = Table(
         title=f"Moved boxes after one contact-rich action: {title}; finest: {FINE} x",
-        caption="mean (95 % interval), median, 95th percentile of the error and mean of "
-        "the distance, mm; median (range) of interleaved runs, one thread",
+        caption="mean (95 % interval), median, 95th percentile of the error, and mean "
+        "of the distance, mm; median (range) of interleaved runs, one thread",
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
