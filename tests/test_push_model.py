@@ -20,6 +20,7 @@ from rhp_drake.task import (
     HAND_ACTIONS,
     HAND_RECTANGLES,
     NUM_ACTIONS,
+    TRANSLATION,
     Action,
     hand_targets,
     object_positions,
@@ -292,3 +293,76 @@ def test_a_failure_of_the_solver_names_its_state(push_model, monkeypatch):
     monkeypatch.setattr("rhp_drake.push_model.transition.Simulator.AdvanceTo", fail)
     with pytest.raises(PushModelError, match=r"0\.25.*assertion failed"):
         push_model.step(CAGED[None], np.array([Action.FORWARD]))
+
+
+def test_swept_test_agrees_with_full_physics(push_model, monkeypatch):
+    """What the swept test calls untouched stays put in a simulation of it all."""
+    generator = stream(3, "full_physics")
+    states = np.array([sample_instance(generator).initial_state for _ in range(300)])
+    states[:, :2] = states[:, 3:5] + generator.uniform(-0.15, 0.15, size=(300, 2))
+    states = states[[not overlapping_bodies(state) for state in states]]
+    actions = generator.integers(len(Action), size=len(states))
+    sides = np.full((len(states), 3, 2), BOX_SIDE)
+    free = first_touches(states, actions, sides) == STEPS_PER_ACTION
+    assert free.sum() > 30
+    states, actions = states[free], actions[free]
+    monkeypatch.setattr(
+        "rhp_drake.push_model.transition.first_touches",
+        lambda states, *_: np.zeros(len(states), dtype=int),
+    )
+    np.testing.assert_allclose(
+        push_model.step(states, actions), states_after(states, actions), atol=1e-9
+    )
+
+
+def states_after(states, actions):
+    """The states if only the hand moves."""
+    after = states.copy()
+    after[:, :3] = hand_targets(states, actions)
+    return after
+
+
+def test_what_was_pushed_is_at_rest(push_model, pairs):
+    """After a push, a hand that goes away leaves the boxes where they are."""
+    states, actions = pairs
+    after = push_model.step(states, actions)
+    away = after.copy()
+    away[:, :2] += [2.0, 0.0]
+    again = push_model.step(away, actions)
+    np.testing.assert_array_equal(again[:, 3:], after[:, 3:])
+
+
+def test_boxes_gain_no_motion_that_the_hand_does_not_have(push_model, pairs):
+    states, _ = pairs
+    for action in HAND_ACTIONS[:4]:
+        after = push_model.step(states, np.full(len(states), action))
+        ways = np.linalg.norm(
+            object_positions(after) - object_positions(states), axis=2
+        )
+        # A corner that turns under the push may go further than the hand, a little.
+        assert ways.max() < 1.3 * TRANSLATION
+
+
+def test_boxes_do_not_pass_through_the_hand_or_each_other(push_model):
+    """Ten pushes in a row: what is before the palm stays there, in order."""
+    state = CAGED.copy()
+    state[:6] = [0.25, 0.01, 0.0, 0.25, 0.0, 0.3]
+    state[6:9] = [0.33, 0.02, 0.1]
+    for _ in range(10):
+        state = push_model.step(state[None], np.array([Action.FORWARD]))[0]
+        palm = state[0] - 0.04
+        assert palm + 0.02 < state[3]
+        beside = abs(state[7] - state[4]) > 0.04
+        assert beside or state[3] + 0.04 < state[6]
+
+
+def test_friction_between_bodies_matters(push_model):
+    state = CAGED.copy()
+    state[:6] = [0.44, 0.02, 0.0, 0.525, 0.0, 0.4]
+    turns = []
+    for friction in (0.05, 1.0):
+        physics = nominal_physics(3)
+        physics.friction[0] = friction
+        after = push_model.step(state[None], np.array([Action.FORWARD]), physics)[0]
+        turns.append(after[5] - state[5])
+    assert abs(turns[0] - turns[1]) > 0.02
