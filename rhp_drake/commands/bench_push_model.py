@@ -185,24 +185,22 @@ def _accuracy_table(accuracies: "Sequence[Accuracy]", title: str) -> "Table":
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
-    table.add_column("\nengine", no_wrap=True)
+    table.add_column("engine,\nsteps", no_wrap=True)
     for heading in (
-        "\nsteps",
         "error against\nits own finest",
-        "to the push\nmodel's",
-        "\nms an action",
+        "to push\nmodel's",
+        "ms a\npush",
         "time over the\npush model's",
     ):
         table.add_column(heading, justify="right", no_wrap=True)
     for i, a in enumerate(accuracies):
         is_last = i + 1 == len(accuracies) or accuracies[i + 1].engine != a.engine
         table.add_row(
-            a.engine,
-            f"{a.refinement} x",
+            f"{a.engine} {a.refinement} x",
             _format_errors(a.own),
             f"{1e3 * a.push_model.mean:.2f}",
-            _format_spread(a.seconds, 1e3, 3),
-            _format_spread(a.slowness, 1.0, 3),
+            f"{1e3 * a.seconds.median:.3f}",
+            _format_spread(a.slowness, 1.0, 2),
             end_section=is_last,
         )
     return table
