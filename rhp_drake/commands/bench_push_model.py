@@ -181,14 +181,15 @@ def _accuracy_table(accuracies: "Sequence[Accuracy]", title: str) -> "Table":
     table = Table(
         title=f"Moved boxes after one contact-rich action: {title}; finest: {FINE} x",
         caption="mean (95 % interval), median, 95th percentile of the error, and mean "
-        "of the distance, mm; median (range) of interleaved runs, one thread",
+        "of that to the push model's finest, mm; median (range) of interleaved runs, "
+        "one thread",
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
     table.add_column("engine,\nsteps", no_wrap=True)
     for heading in (
         "error against\nits own finest",
-        "to push\nmodel's",
+        "to\nours",
         "ms a\npush",
         "time over the\npush model's",
     ):
