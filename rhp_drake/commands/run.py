@@ -17,9 +17,13 @@ from rhp_drake.planning.policy_config import PAPER_POLICIES
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
+    from pydrake.systems.analysis import Simulator
+    from rich.console import Console
+
     from rhp_drake.closed_loop import Outcome
     from rhp_drake.scenario import Scenario
     from rhp_drake.systems.receding_horizon_planner import DecisionRecord
+    from rhp_drake.task import TaskInstance
 
 INTERRUPTED: Final = "interrupted"
 
@@ -118,11 +122,9 @@ def _run(
     from rich.console import Console
     import torch
 
-    from rhp_drake.closed_loop import MakeClosedLoop, Outcome, run_closed_loop
+    from rhp_drake.closed_loop import MakeClosedLoop
     from rhp_drake.files import make_folder, write_atomically
-    from rhp_drake.physics import draw_physics
     from rhp_drake.planning.policy_config import MakePolicy
-    from rhp_drake.random_streams import stream
     from rhp_drake.run_record import make_run_record, write_record
     from rhp_drake.scenario import make_task_instance
     from rhp_drake.visualization import FRAME_PERIOD, MakeMeshcat
@@ -134,11 +136,6 @@ def _run(
     # No markup: a message may well have brackets of its own.
     console = Console(highlight=False, markup=False, soft_wrap=True)
     instance = make_task_instance(scenario)
-    physics = draw_physics(
-        scenario.world_physics,
-        instance.initial_state,
-        stream(scenario.seed, "world_physics"),
-    )
     policy = MakePolicy(
         scenario.policy, instance.num_objects, num_threads=os.cpu_count() or 1
     )
@@ -156,31 +153,8 @@ def _run(
         meshcat.StartRecording(frames_per_second=1 / FRAME_PERIOD)
     console.print("  #  action             value  thought     to goal", style="dim")
 
-    decisions: list[DecisionRecord] = []
-
-    def on_decision(record: "DecisionRecord") -> None:
-        decisions.append(record)
-        console.print(_decision_line(record))
-
     started, clock = datetime.now().astimezone(), time.perf_counter()
-    try:
-        outcome = run_closed_loop(
-            simulator,
-            instance,
-            physics,
-            seed=scenario.seed,
-            time_limit=scenario.time_limit,
-            on_decision=on_decision,
-        )
-    except KeyboardInterrupt:
-        # What has happened so far is worth keeping.
-        outcome = Outcome(
-            status=INTERRUPTED,
-            message="stopped by the user.",
-            num_actions=len(decisions),
-            time=simulator.get_context().get_time(),
-            target_distance=decisions[-1].target_distance if decisions else math.nan,
-        )
+    outcome, decisions = _simulate(simulator, scenario, instance, console)
     seconds = time.perf_counter() - clock
 
     times = {"started": started.isoformat(timespec="seconds"), "seconds": seconds}
@@ -201,6 +175,49 @@ def _run(
     )
     console.print(f"Results: {folder}")
     return outcome
+
+
+def _simulate(
+    simulator: "Simulator",
+    scenario: "Scenario",
+    instance: "TaskInstance",
+    console: "Console",
+) -> "tuple[Outcome, list[DecisionRecord]]":
+    """Runs the task to its end, or to the user's, and says each decision."""
+    from rhp_drake.closed_loop import Outcome, run_closed_loop
+    from rhp_drake.physics import draw_physics
+    from rhp_drake.random_streams import stream
+
+    physics = draw_physics(
+        scenario.world_physics,
+        instance.initial_state,
+        stream(scenario.seed, "world_physics"),
+    )
+    decisions: list[DecisionRecord] = []
+
+    def on_decision(record: "DecisionRecord") -> None:
+        decisions.append(record)
+        console.print(_decision_line(record))
+
+    try:
+        outcome = run_closed_loop(
+            simulator,
+            instance,
+            physics,
+            seed=scenario.seed,
+            time_limit=scenario.time_limit,
+            on_decision=on_decision,
+        )
+    except KeyboardInterrupt:
+        # What has happened so far is worth keeping.
+        outcome = Outcome(
+            status=INTERRUPTED,
+            message="stopped by the user.",
+            num_actions=len(decisions),
+            time=simulator.get_context().get_time(),
+            target_distance=decisions[-1].target_distance if decisions else math.nan,
+        )
+    return outcome, decisions
 
 
 def _decision_line(record: "DecisionRecord") -> str:
