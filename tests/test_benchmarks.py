@@ -95,7 +95,7 @@ def test_speed_by_threads(pairs):
     assert one.actions_per_second.low > 0
 
 
-def test_times_of_decisions_add_up():
+def test_times_of_decisions():
     instances = load_instances(VALIDATION)
     (times,) = measure_decisions(QNetwork(3).eval(), instances, 3, [1])
     assert times.decisions == 3

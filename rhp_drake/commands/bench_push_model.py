@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rhp_drake.errors import InputError
+from rhp_drake.planning.policy_config import DEFAULT_Q_NETWORK
 
 # Drake is imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -19,12 +19,6 @@ if TYPE_CHECKING:
     from rhp_drake.benchmarks.push_model import Accuracy, Errors, Speed, Spread
     from rhp_drake.evaluation.episode import Episode
 
-# Tried in turn where the user names no weights.
-_WEIGHTS = (
-    "package://rhp_drake/q_network/three_boxes.safetensors",
-    "package://rhp_drake/q_network/imitation.safetensors",
-)
-
 
 def push_model(
     *,
@@ -34,8 +28,8 @@ def push_model(
         int, typer.Option(min=0, help="Validation instances a world; 0: none.")
     ] = 100,
     weights: Annotated[
-        str | None, typer.Option(help="File of the Q-network's weights.")
-    ] = None,
+        str, typer.Option(help="File of the Q-network's weights.")
+    ] = DEFAULT_Q_NETWORK,
     seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
     workers: Annotated[
         int, typer.Option(min=1, help="Processes of the closed loop.")
@@ -53,16 +47,21 @@ def push_model(
     from rhp_drake.benchmarks.engines import describe_engines
     from rhp_drake.evaluation.statistics import describe_machine
     from rhp_drake.files import check_writable
+    from rhp_drake.frozen_instances import NUM_OBJECTS
+    from rhp_drake.resources import resolve
+    from rhp_drake.value.q_network import load_q_network
 
     # Before the minutes of work.
-    weights_path = _find_weights(weights) if decisions or instances else None
+    weights_path = resolve(weights)
+    if decisions or instances:
+        load_q_network(weights_path, NUM_OBJECTS)
     if out is not None:
         check_writable(out)
     console = Console()
     results = _measure_transitions(console, pairs, seed)
-    if decisions and weights_path:
+    if decisions:
         results["decisions"] = _measure_decisions(console, decisions, weights_path)
-    if instances and weights_path:
+    if instances:
         results["closed_loop"] = _measure_closed_loop(
             console, instances, weights_path, workers
         )
@@ -74,19 +73,6 @@ def push_model(
         from rhp_drake.files import write_atomically
 
         write_atomically(out, json.dumps(results, indent=1) + "\n")
-
-
-def _find_weights(weights: str | None) -> Path:
-    from rhp_drake.resources import resolve
-
-    candidates = [resolve(uri) for uri in ([weights] if weights else _WEIGHTS)]
-    for path in candidates:
-        if path.is_file():
-            return path
-    raise InputError(
-        f"{candidates[0]}: there is no such file of weights; name one with --weights, "
-        "or do without by --decisions 0 --instances 0."
-    )
 
 
 def _measure_transitions(console: "Console", count: int, seed: int) -> dict:
