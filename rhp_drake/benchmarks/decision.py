@@ -3,22 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 import time
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from rhp_drake.evaluation.episode import run_episode
 from rhp_drake.physics import ObjectPhysics
 from rhp_drake.planning.policy import Decision, PolicyError
+from rhp_drake.planning.policy_config import RecedingHorizonConfig
 from rhp_drake.planning.receding_horizon import RecedingHorizon, ValueFunction
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import TaskInstance
 from rhp_drake.value.q_network import QNetwork
-
-_NUM_ROLL_OUTS: Final = 6
-_HORIZON: Final = 6
-_TEMPERATURE: Final = 0.5  # The default of `RecedingHorizonConfig`.
 
 
 @dataclass(frozen=True)
@@ -158,8 +155,15 @@ class _Recorder:
 
 
 def make_rhp66(network: ValueFunction, push_model: PushModel) -> RecedingHorizon:
-    """RHP with six roll-outs of six actions."""
-    return RecedingHorizon(push_model, network, _NUM_ROLL_OUTS, _HORIZON, _TEMPERATURE)
+    """RHP with six roll-outs of six actions, the default."""
+    config = RecedingHorizonConfig()
+    return RecedingHorizon(
+        push_model,
+        network,
+        config.num_roll_outs,
+        config.horizon,
+        config.temperature,
+    )
 
 
 def measure_decisions(

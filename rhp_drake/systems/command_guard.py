@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
+from rhp_drake.systems.latching import latch_position
 
 
 class Fault(enum.IntEnum):
@@ -94,12 +95,7 @@ class CommandGuard(LeafSystem):
         )
 
     def _Initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
-        measured = self._measured_port.Eval(context)
-        if not np.isfinite(measured).all():
-            raise RuntimeError(
-                f"The measured joint positions {measured} are not finite: "
-                "there is no position to hold."
-            )
+        measured = latch_position(self._measured_port, context)
         discrete_state.set_value(self._position, measured)
         discrete_state.set_value(self._fault, np.array([float(Fault.NONE)]))
 

@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from rhp_drake.errors import InputError
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.station.ur5_kinematics import hand_pose, inverse_kinematics
+from rhp_drake.systems.latching import latch_position
 
 LINEAR_SPEED: Final = 0.12  # m/s, peak
 ANGULAR_SPEED: Final = 0.6  # rad/s, peak
@@ -111,12 +112,7 @@ class HandServo(LeafSystem):
         )
 
     def _Initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
-        measured = self._measured_port.Eval(context)
-        if not np.isfinite(measured).all():
-            raise RuntimeError(
-                f"The measured joint positions {measured} are not finite: "
-                "the hand's motion has no start."
-            )
+        measured = latch_position(self._measured_port, context)
         discrete_state.set_value(self._position, measured)
         self._Hold(hand_pose(measured), discrete_state)
 
