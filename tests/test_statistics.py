@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from rhp_drake.evaluation.machine import describe_machine
 from rhp_drake.evaluation.statistics import (
     bootstrap_interval,
-    describe_machine,
     format_rate,
     wilson_interval,
 )

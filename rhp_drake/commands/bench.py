@@ -41,8 +41,8 @@ def model_gap(
     from rich.console import Console
     from rich.progress import track
 
+    from rhp_drake.evaluation.machine import describe_machine
     from rhp_drake.evaluation.model_gap import compare_pushes
-    from rhp_drake.evaluation.statistics import describe_machine
 
     console = Console()
     results = list(

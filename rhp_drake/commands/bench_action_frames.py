@@ -18,7 +18,8 @@ def action_frames(
     from rich.table import Table
 
     from rhp_drake.benchmarks.action_frames import ACTION_SETS, compare_action_frames
-    from rhp_drake.evaluation.statistics import describe_machine, format_rate
+    from rhp_drake.evaluation.machine import describe_machine
+    from rhp_drake.evaluation.statistics import format_rate
 
     console = Console()
     results = list(

@@ -45,7 +45,7 @@ def push_model(
     from rich.console import Console
 
     from rhp_drake.benchmarks.engines import describe_engines
-    from rhp_drake.evaluation.statistics import describe_machine
+    from rhp_drake.evaluation.machine import describe_machine
     from rhp_drake.files import check_writable
     from rhp_drake.frozen_instances import NUM_OBJECTS
     from rhp_drake.resources import resolve

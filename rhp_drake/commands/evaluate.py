@@ -38,7 +38,7 @@ def evaluate(
     from rich.progress import track
 
     from rhp_drake.evaluation.comparison import Comparison, make_table, run_comparison
-    from rhp_drake.evaluation.statistics import describe_machine
+    from rhp_drake.evaluation.machine import describe_machine
     from rhp_drake.files import check_writable
 
     comparison = Comparison(

@@ -1,9 +1,9 @@
 """Policies side by side on the same task instances."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from typing import Final
+from functools import partial
+from typing import Final, TypeAlias
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -15,6 +15,7 @@ from rhp_drake.evaluation.statistics import format_rate
 from rhp_drake.frozen_instances import load_instances
 from rhp_drake.planning.policy_config import MakePolicy, PolicyConfig
 from rhp_drake.push_model.transition import PushModel
+from rhp_drake.task import TaskInstance
 from rhp_drake.workers import run_over
 
 PLANAR: Final = "planar"
@@ -75,29 +76,28 @@ class Comparison:
         ]
 
 
-@lru_cache(maxsize=8)
-def _worker_tools(config_text: str) -> dict:
-    """What a process keeps from trial to trial, by the policy's description."""
-    return {}
+# Runs an instance, under a seed and with its index in the set.
+_Runner: TypeAlias = Callable[[TaskInstance, int, int], Episode]
+# What a process keeps from trial to trial, by world and policy: both are dear to make.
+_runners: dict[str, _Runner] = {}
+
+
+def _make_runner(config: PolicyConfig, world: str, num_objects: int) -> _Runner:
+    policy = MakePolicy(config, num_objects)
+    if world == PLANAR:
+        return partial(run_episode, PushModel(num_objects), policy)
+    from rhp_drake.evaluation.station_world import StationWorld
+
+    return StationWorld(policy).run_episode
 
 
 def _run_trial(trial: Trial, comparison: Comparison) -> Episode:
-    config = comparison.policies[trial.policy]
+    config, world = comparison.policies[trial.policy], comparison.world
     instance = load_instances(comparison.instances)[trial.index]
-    tools = _worker_tools(f"{comparison.world} {config!r}")
-    if not tools:
-        tools["policy"] = MakePolicy(config, instance.num_objects)
-        if comparison.world == PLANAR:
-            tools["world"] = PushModel(instance.num_objects)
-        else:
-            from rhp_drake.evaluation.station_world import StationWorld
-
-            tools["world"] = StationWorld(tools["policy"])
-    if comparison.world == PLANAR:
-        return run_episode(
-            tools["world"], tools["policy"], instance, comparison.seed, trial.index
-        )
-    return tools["world"].run_episode(instance, comparison.seed, trial.index)
+    key = f"{world} {config!r}"
+    if key not in _runners:
+        _runners[key] = _make_runner(config, world, instance.num_objects)
+    return _runners[key](instance, comparison.seed, trial.index)
 
 
 def run_comparison(

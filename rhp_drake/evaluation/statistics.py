@@ -1,8 +1,6 @@
-"""Statistics that every table here uses, and the machine they were made on."""
+"""Statistics that every table here uses."""
 
 from collections.abc import Sequence
-from importlib.metadata import version
-import platform
 
 import numpy as np
 from scipy.stats import binomtest
@@ -38,21 +36,3 @@ def bootstrap_interval(
     means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)
-
-
-def describe_machine(num_workers: int = 1) -> str:
-    """One line: processor, cores, workers and the versions that matter to speed."""
-    model = platform.processor() or platform.machine()
-    cores = 0
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            lines = file.readlines()
-        models = [x.split(":", 1)[1].strip() for x in lines if "model name" in x]
-        model, cores = models[0], len(models)
-    except (OSError, IndexError):
-        pass  # Not Linux: say what Python knows.
-    return (
-        f"{model}, {cores or '?'} cores, {num_workers} worker(s), "
-        f"Python {platform.python_version()}, drake {version('drake')}, "
-        f"torch {version('torch')}"
-    )
