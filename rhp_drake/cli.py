@@ -5,10 +5,11 @@ import sys
 import typer
 
 from rhp_drake.commands.bench import bench
+from rhp_drake.commands.demos import demos
 from rhp_drake.commands.evaluate import evaluate
-from rhp_drake.commands.learn import demos, fit, imitate
+from rhp_drake.commands.learn import fit, imitate
 from rhp_drake.commands.run import run
-from rhp_drake.errors import InputError
+from rhp_drake.errors import InputError, WorkError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -16,8 +17,9 @@ app = typer.Typer(
     # A traceback is for developers; it need not fill the screen with variables.
     pretty_exceptions_show_locals=False,
 )
-for command in (run, demos, imitate, fit, evaluate):
+for command in (run, imitate, fit, evaluate):
     app.command()(command)
+app.add_typer(demos, name="demos")
 app.add_typer(bench, name="bench")
 
 
@@ -33,6 +35,9 @@ def main() -> None:
     except InputError as error:
         print(f"rhp: {error}", file=sys.stderr)
         sys.exit(2)
+    except WorkError as error:
+        print(f"rhp: {error}", file=sys.stderr)
+        sys.exit(1)
 
 
 if __name__ == "__main__":

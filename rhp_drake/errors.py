@@ -1,8 +1,16 @@
-"""The one error for bad input, which the command line turns into exit status 2."""
+"""The errors that the command line turns into one sentence and an exit status."""
 
 
 class InputError(ValueError):
-    """A user gave something that cannot work.
+    """A user gave something that cannot work: exit status 2.
 
     The message is one clear sentence that says what is wrong and where.
+    """
+
+
+class WorkError(RuntimeError):
+    """Work cannot go on, by no fault of what it was given: exit status 1.
+
+    A full disk, a killed worker, a lost cluster.  What is done is in files, and the
+    same command goes on from there.
     """

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from rhp_drake.errors import InputError
+from rhp_drake.errors import InputError, WorkError
 
 
 def make_folder(path: Path) -> None:
@@ -36,6 +36,9 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
     Whoever reads `path` sees the old content or the new, never a half; the folder is
     made if need be.
+
+    Raises:
+        WorkError: If it cannot be written, for example because the disk is full.
     """
     make_folder(path.parent)
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
@@ -43,5 +46,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     try:
         temporary.write_bytes(data)
         temporary.replace(path)
+    except OSError as error:
+        raise WorkError(f"{path}: cannot be written: {error.strerror}.") from error
     finally:
         temporary.unlink(missing_ok=True)

@@ -1,13 +1,40 @@
-"""Runs a function over many items, in this process or in several."""
+"""Runs a function over many items: in this process, in several, or on a Ray cluster."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from itertools import islice
+import logging
 import multiprocessing
 import os
-from typing import TypeVar
+from typing import Any, Final, TypeAlias, TypeVar
+
+from rhp_drake.errors import InputError, WorkError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class RayCluster:
+    """A Ray cluster, on whose nodes rhp_drake is installed.
+
+    Attributes:
+        address: What `ray.init` takes: "auto" for the cluster this machine is part of,
+            or HOST:PORT of its head.
+    """
+
+    address: str
+
+
+# A number of processes, of one thread each (1: this process), or a cluster.
+Workers: TypeAlias = int | RayCluster
+
+# Tasks of a cluster in flight for each of its cores: enough to keep them busy.
+_IN_FLIGHT: Final = 2
+# How often a task is done again whose node dies.
+_RETRIES: Final = 10
 
 
 def _use_one_thread() -> None:
@@ -24,20 +51,32 @@ def _use_one_thread() -> None:
 
 
 def run_over(
-    function: Callable[[Item], Result], items: Sequence[Item], num_workers: int
+    function: Callable[[Item], Result], items: Sequence[Item], workers: Workers
 ) -> Iterator[tuple[Item, Result]]:
     """Yields (item, function(item)), in whatever order they finish.
 
     Args:
         function: A picklable function; what it draws must depend on its item alone.
         items: Picklable.
-        num_workers: Processes, of one thread each; 1 runs in this one.
+        workers: Who does it.
+
+    Raises:
+        InputError: If there is no such cluster, or a function says so.
+        WorkError: If a process dies.
     """
-    if num_workers <= 1:
+    if isinstance(workers, RayCluster):
+        yield from _run_on_cluster(function, items, workers)
+    elif workers <= 1:
         _use_one_thread()
         for item in items:
             yield item, function(item)
-        return
+    else:
+        yield from _run_in_processes(function, items, workers)
+
+
+def _run_in_processes(
+    function: Callable[[Item], Result], items: Sequence[Item], num_workers: int
+) -> Iterator[tuple[Item, Result]]:
     # Drake and torch start threads, which a forked child would inherit broken.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
@@ -46,6 +85,59 @@ def run_over(
         futures = {pool.submit(function, item): item for item in items}
         try:
             for future in as_completed(futures):
-                yield futures[future], future.result()
+                # Results may be large: none is kept.
+                item = futures.pop(future)
+                yield item, future.result()
+        except BrokenProcessPool:
+            raise WorkError(
+                "a worker process died; was it killed, or out of memory?"
+            ) from None
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _run_on_cluster(
+    function: Callable[[Item], Result], items: Sequence[Item], cluster: RayCluster
+) -> Iterator[tuple[Item, Result]]:
+    try:
+        import ray
+    except ImportError:
+        raise InputError(
+            'a cluster needs Ray: pip install -e ".[distributed]".'
+        ) from None
+    try:
+        ray.init(
+            address=cluster.address, log_to_driver=False, logging_level=logging.ERROR
+        )
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        message = str(error).partition("\n")[0]
+        raise InputError(f"no Ray cluster at {cluster.address!r}: {message}") from None
+    # Ray itself does a task again whose node dies.
+    remote: Any = ray.remote(_run_remotely).options(max_retries=_RETRIES)
+    shared = ray.put(function)
+    left = iter(items)
+    running: dict[Any, Item] = {}
+    try:
+        while True:
+            cores = int(ray.cluster_resources().get("CPU", 1))
+            room = max(_IN_FLIGHT * cores, len(running))
+            for item in islice(left, room - len(running)):
+                running[remote.remote(shared, item)] = item
+            if not running:
+                return
+            (done, *_), _ = ray.wait(list(running))
+            item = running.pop(done)
+            yield item, ray.get(done)
+    except ray.exceptions.RayTaskError as error:
+        # What the function raised, as the other workers raise it.
+        raise error.cause from None
+    except ray.exceptions.RayError as error:
+        message = str(error).partition("\n")[0]
+        raise WorkError(f"the Ray cluster failed: {message}") from error
+    finally:
+        ray.shutdown()
+
+
+def _run_remotely(function: Callable[[Item], Result], item: Item) -> Result:
+    _use_one_thread()
+    return function(item)

@@ -1,4 +1,4 @@
-"""`rhp demos`, `rhp imitate` and `rhp fit`: from plans to a Q-network."""
+"""`rhp imitate` and `rhp fit`: from demonstrations to a Q-network."""
 
 import hashlib
 from pathlib import Path
@@ -16,58 +16,11 @@ if TYPE_CHECKING:
     from rhp_drake.value.q_network import QNetwork
 
 _Demos = Annotated[
-    list[Path], typer.Option(help="Folder of demonstrations; may be repeated.")
+    list[Path],
+    typer.Option(help="File or folder of demonstrations; may be repeated."),
 ]
 _Out = Annotated[Path, typer.Option(help="File of the trained weights.")]
 _Seed = Annotated[int, typer.Option(min=0, help="Of all random draws.")]
-
-
-def demos(
-    *,
-    plans: Annotated[int, typer.Option(min=1, help="Training tasks to solve.")],
-    out: Annotated[Path, typer.Option(help="Folder of the shards.")],
-    weights: Annotated[
-        Path | None,
-        typer.Option(help="Act by epsilon-RHP with these weights, do not plan."),
-    ] = None,
-    first_task: Annotated[int, typer.Option(min=0, help="Its number.")] = 0,
-    seed: _Seed = 0,
-    objects: Annotated[int, typer.Option(min=1, help="m.")] = 3,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
-) -> None:
-    """Makes demonstrations: plans and all that was simulated to find them.
-
-    Stopped at any moment, the same command goes on where it was.
-    """
-    from rich.console import Console
-
-    from rhp_drake.learning.demonstrations import (
-        Demonstrator,
-        load_demonstrations,
-        make_demonstrations,
-    )
-    from rhp_drake.learning.demonstrators import (
-        PlanningDemonstrator,
-        RecedingHorizonDemonstrator,
-    )
-    from rhp_drake.value.q_network import load_q_network
-
-    demonstrator: Demonstrator = PlanningDemonstrator(seed, objects, first_task)
-    if weights is not None:
-        load_q_network(weights, objects)  # Bad weights are better found out here.
-        demonstrator = RecedingHorizonDemonstrator(seed, objects, weights, first_task)
-    console = Console()
-    with _progress(console) as progress:
-        bar = progress.add_task("Plans", total=plans)
-        for done in make_demonstrations(out, plans, demonstrator, workers):
-            progress.update(bar, completed=min(done, plans))
-    data = load_demonstrations([out])
-    solved = int(data.solved.sum())
-    console.print(
-        f"{out}: {solved} of {len(data.solved)} tasks solved, "
-        f"{len(data.plan_actions) / max(solved, 1):.1f} actions a plan, "
-        f"{len(data.search_actions)} transitions."
-    )
 
 
 def imitate(
@@ -81,6 +34,7 @@ def imitate(
     from rich.console import Console
     import torch
 
+    from rhp_drake.commands.progress import make_progress
     from rhp_drake.files import check_writable
     from rhp_drake.learning.demonstrations import load_demonstrations
     from rhp_drake.learning.imitation import ImitationConfig, imitate
@@ -97,7 +51,7 @@ def imitate(
     torch.manual_seed(seed)
     network = QNetwork(data.goals.shape[1])
     loss = float("nan")
-    with _progress(console) as progress:
+    with make_progress(console) as progress:
         bar = progress.add_task("Epochs", total=epochs)
         for loss in imitate(network, data, config, stream(seed, "imitation")):
             progress.update(bar, advance=1, description=f"loss {loss:.2f}")
@@ -122,11 +76,10 @@ def fit(
     from rich.console import Console
     import torch
 
+    from rhp_drake.commands.progress import make_progress
     from rhp_drake.files import check_writable
-    from rhp_drake.learning.demonstrations import (
-        load_demonstrations,
-        read_description,
-    )
+    from rhp_drake.learning.demonstration_folder import describe
+    from rhp_drake.learning.demonstrations import load_demonstrations
     from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import load_q_network
@@ -142,14 +95,14 @@ def fit(
     origin = {
         "seed": seed,
         "start": hashlib.sha256(start.read_bytes()).hexdigest(),
-        "demonstrations": [read_description(folder) for folder in demonstrations],
+        "demonstrations": [describe(path) for path in demonstrations],
         "transitions": len(data.search_actions),
     }
     checkpoint = out.with_name(out.name + ".checkpoint")
     if checkpoint.exists():
         learner.resume(checkpoint, origin)
         console.print(f"Goes on from step {learner.num_steps} of {checkpoint}.")
-    with _progress(console) as progress:
+    with make_progress(console) as progress:
         bar = progress.add_task("Steps", total=steps, completed=learner.num_steps)
         while learner.num_steps < steps:
             learner.step()
@@ -167,38 +120,17 @@ def fit(
     checkpoint.unlink(missing_ok=True)
 
 
-def _progress(console: Any) -> Any:
-    """A progress bar with count, rate and time left."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
-
-
 def _save(
     network: "QNetwork",
     path: Path,
-    folders: list[Path],
+    sources: list[Path],
     data: Any,
     seed: int,
     details: dict[str, Any],
     console: Any,
 ) -> None:
     """Writes the weights with where they come from."""
-    from rhp_drake.learning.demonstrations import read_description
+    from rhp_drake.learning.demonstration_folder import describe
     from rhp_drake.run_record import source_commit
 
     successes, trials = _greedy_successes(network)
@@ -206,7 +138,7 @@ def _save(
         "command": " ".join(["rhp", *sys.argv[1:]]),
         "commit": source_commit(),
         "seed": seed,
-        "demonstrations": [read_description(folder) for folder in folders],
+        "demonstrations": [describe(path) for path in sources],
         "plans": len(data.goals),
         "plans_solved": int(data.solved.sum()),
         "transitions": len(data.search_actions),

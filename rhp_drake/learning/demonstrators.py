@@ -1,25 +1,27 @@
-"""Who makes demonstrations: the kinodynamic RRT, and RHP with weights it has."""
+"""Who makes demonstrations: the RRT, a search guided by a Q-network, and RHP."""
 
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+import time
 from typing import Final
 
 import numpy as np
 
-from rhp_drake.learning.demonstrations import Demonstrations, make_demonstration
-from rhp_drake.planning.kinodynamic_rrt import plan
+from rhp_drake.learning.demonstration import Demonstration, training_task
+from rhp_drake.planning.best_first import plan_best_first
+from rhp_drake.planning.kinodynamic_rrt import IMPROVEMENT, plan
 from rhp_drake.planning.policy import PolicyError
-from rhp_drake.planning.receding_horizon import RecedingHorizon
-from rhp_drake.planning.search import Search, SearchRecord
+from rhp_drake.planning.receding_horizon import RecedingHorizon, ValueFunction
+from rhp_drake.planning.search import Plan, Search, SearchRecord
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import TRAINING, stream
 from rhp_drake.task import (
     MAX_ACTIONS,
+    TaskInstance,
     allowed_actions,
     goals_reached,
     objects_fallen,
-    sample_instance,
 )
 from rhp_drake.value.q_network import load_q_network
 
@@ -29,7 +31,7 @@ _MAX_TRANSITIONS: Final = 6000
 
 @dataclass(frozen=True)
 class PlanningDemonstrator:
-    """Plans with the kinodynamic RRT (section IV-A of the paper).
+    """Plans with the kinodynamic RRT (section IV-A of the paper), and shortens plans.
 
     Attributes:
         seed: Of the tasks and the searches.
@@ -45,20 +47,55 @@ class PlanningDemonstrator:
     def _push_model(self) -> PushModel:
         return PushModel(self.num_objects)
 
-    def demonstrate(self, index: int) -> Demonstrations:
-        """See `demonstrations.Demonstrator`."""
-        task = self.first_task + index
-        instance = sample_instance(stream(self.seed, TRAINING, task), self.num_objects)
+    def demonstrate(self, task: int) -> Demonstration:
+        """See `demonstration.Demonstrator`."""
+        instance = training_task(self.seed, task, self.num_objects)
         found = plan(
             self._push_model,
             instance.initial_state,
             instance.goals,
             stream(self.seed, TRAINING, task, "kinodynamic_rrt"),
             max_transitions=_MAX_TRANSITIONS,
+            improvement=IMPROVEMENT,
         )
-        return make_demonstration(
-            instance.goals, found.actions, found.states, found.search
+        return _demonstration(self.seed, task, instance, found)
+
+
+@dataclass(frozen=True)
+class GuidedDemonstrator:
+    """Plans best first, with the actions that a Q-network proposes.
+
+    Attributes:
+        seed: Of the tasks.
+        num_objects: m.
+        weights: File of the Q-network.
+        first_task: Number of the first task.
+    """
+
+    seed: int
+    num_objects: int
+    weights: Path
+    first_task: int = 0
+
+    @cached_property
+    def _push_model(self) -> PushModel:
+        return PushModel(self.num_objects)
+
+    @cached_property
+    def _q_network(self) -> ValueFunction:
+        return load_q_network(self.weights, self.num_objects)
+
+    def demonstrate(self, task: int) -> Demonstration:
+        """See `demonstration.Demonstrator`."""
+        instance = training_task(self.seed, task, self.num_objects)
+        found = plan_best_first(
+            self._push_model,
+            self._q_network,
+            instance.initial_state,
+            instance.goals,
+            max_transitions=_MAX_TRANSITIONS,
         )
+        return _demonstration(self.seed, task, instance, found)
 
 
 @dataclass(frozen=True)
@@ -90,14 +127,14 @@ class RecedingHorizonDemonstrator:
         q_network = load_q_network(self.weights, self.num_objects)
         return RecedingHorizon(self._recorder, q_network, 6, 6, self.temperature)
 
-    def demonstrate(self, index: int) -> Demonstrations:
-        """See `demonstrations.Demonstrator`."""
-        task = self.first_task + index
-        instance = sample_instance(stream(self.seed, TRAINING, task), self.num_objects)
+    def demonstrate(self, task: int) -> Demonstration:
+        """See `demonstration.Demonstrator`."""
+        begin = time.perf_counter()
+        instance = training_task(self.seed, task, self.num_objects)
         generator = stream(self.seed, TRAINING, task, "epsilon_rhp")
         state, goals = instance.initial_state, instance.goals
         self._recorder.forget()
-        states, actions = [], []
+        states, actions = [state], []
         for _ in range(MAX_ACTIONS):
             explores = generator.random() < self.epsilon
             try:
@@ -107,18 +144,26 @@ class RecedingHorizonDemonstrator:
             action = decision.action
             if explores:
                 action = int(generator.choice(np.flatnonzero(allowed_actions(state))))
+            state = self._recorder.step(state[None], np.array([action]))[0]
             states.append(state)
             actions.append(action)
-            state = self._recorder.step(state[None], np.array([action]))[0]
             if goals_reached(state, goals) or objects_fallen(state):
                 break
-        solved = bool(goals_reached(state, goals))
-        return make_demonstration(
-            goals,
-            np.array(actions) if solved else None,
-            np.array(states),
-            self._recorder.search(),
-        )
+        seconds = time.perf_counter() - begin
+        search = self._recorder.search()
+        if goals_reached(state, goals):
+            found = Plan(np.array(actions), np.array(states), search, seconds)
+        else:
+            found = Plan(None, instance.initial_state[None], search, seconds)
+        return _demonstration(self.seed, task, instance, found)
+
+
+def _demonstration(
+    seed: int, task: int, instance: TaskInstance, found: Plan
+) -> Demonstration:
+    return Demonstration(
+        seed, task, instance, found.actions, found.states, found.search, found.seconds
+    )
 
 
 class _RecordingPushModel:
@@ -152,7 +197,10 @@ class _RecordingPushModel:
                 self._known[keys[i]] = child
                 origin = self._origins.get(keys[i][0], -1)
                 (index,) = self._record.add(
-                    states[i], actions[i : i + 1], child[None], origin
+                    states[i : i + 1],
+                    actions[i : i + 1],
+                    child[None],
+                    np.array([origin]),
                 )
                 self._origins.setdefault(child.tobytes(), int(index))
         return np.array([self._known[key] for key in keys])

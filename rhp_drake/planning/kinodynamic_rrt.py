@@ -5,16 +5,20 @@ are actions of the push model, and whatever the physics does in between is taken
 it comes.  Where this one differs: the tree grows towards places *for the target*,
 and "near" means near to having pushed it there: the hand counts by its pose relative
 to the node's own target object.
+
+The first plan of an RRT has detours.  It gets shorter by growing further trees that
+are cut where they can no longer beat it, and keeping the best plan (anytime RRTs,
+Ferguson and Stentz 2006).  To leave out actions of the plan and simulate the rest anew
+saved half as many actions for the same number of transitions.
 """
 
-from dataclasses import dataclass
 import math
 import time
 from typing import Final
 
 import numpy as np
 
-from rhp_drake.planning.search import Search, SearchRecord
+from rhp_drake.planning.search import Nodes, Plan, SearchRecord, hopeless
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
@@ -28,46 +32,28 @@ from rhp_drake.task import (
     allowed_actions,
     goals_reached,
     object_positions,
-    objects_fallen,
 )
 
 # How often the place to grow to is the goal rather than a random one.
 _GOAL_BIAS: Final = 0.75
 # Weights in the distance, in actions: of the hand's way to its pushing pose, of each
 # obstacle's displacement, and of the actions already taken, against the target's way.
-# Each tree draws its own between these bounds.
+# Each tree draws its own between these bounds...
 _LIGHTEST: Final = np.array([0.4, 0.5, 0.0])
 _HEAVIEST: Final = np.array([1.0, 1.5, 0.4])
+# ...and minds the actions already taken more when there is a plan to beat.
+_LIGHTEST_TO_IMPROVE: Final = np.array([0.4, 0.5, 0.4])
+_HEAVIEST_TO_IMPROVE: Final = np.array([1.0, 1.5, 1.0])
 # Simulated actions after which a tree is given up for a fresh one: the time to a plan
 # is heavy-tailed, and another tree's luck beats this one's patience.
 _RESTART: Final = 1500
-# m: an obstacle this far out of its region is as good as lost.
-_OBSTACLE_LIMIT: Final = 1.5 * GOAL_RADIUS
-# m: states closer than this in every coordinate are the same to the planner...
-_DUPLICATE_DISTANCE: Final = 0.012
-# ...with this many metres to a radian.
-_ANGLE_LENGTH: Final = 0.1
+# Actions that are worth simulating for a shorter plan: on 60 validation tasks 600,
+# 1200 and 2000 of them lead from 16.7 actions to 15.5, 15.0 and 14.8.
+IMPROVEMENT: Final = 1000
 # m: the hand's opening.
 _OPENING: Final = 0.10
 # rad: how far from the hand's heading it can still push an object in its opening.
 _WIDEST_PUSH: Final = math.radians(100)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What the planner found.
-
-    Attributes:
-        actions: Shape (L,); None if no plan was found within the limits.
-        states: s_0 ... s_L, shape (L + 1, 3 + 3 m); s_0 alone without a plan.
-        search: All that was simulated, the pruned children included.
-        seconds: Time it took.
-    """
-
-    actions: np.ndarray | None
-    states: np.ndarray
-    search: Search
-    seconds: float
 
 
 def _wrap(angle: np.ndarray) -> np.ndarray:
@@ -97,50 +83,67 @@ def _hand_actions(
     )
 
 
+def fewest_actions_left(states: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """How many translations it takes at least to push the target home.
+
+    Args:
+        states: Shape (..., 3 + 3 m).
+        goals: Shape (m, 2).
+
+    Returns:
+        Whole numbers of shape (...).  (A turn may move a target at a finger's tip a
+        little further than a translation would.)
+    """
+    offsets = object_positions(states)[..., 0, :] - goals[0]
+    distance = np.linalg.norm(offsets, axis=-1) - GOAL_RADIUS
+    return np.ceil(np.maximum(distance, 0) / TRANSLATION)
+
+
 class _Tree:
-    """A growing tree: its nodes, and which of them were not expanded yet."""
+    """A growing tree: its nodes, and which of them were not expanded yet.
+
+    Args:
+        state: Of its root.
+        goals: Shape (m, 2).
+        generator: Draws its weights.
+        length_to_beat: Of the shortest plan so far; None if there is none.
+    """
 
     def __init__(
-        self, state: np.ndarray, goals: np.ndarray, generator: np.random.Generator
+        self,
+        state: np.ndarray,
+        goals: np.ndarray,
+        generator: np.random.Generator,
+        length_to_beat: int | None = None,
     ) -> None:
         self.goals = goals
-        self._weights = generator.uniform(_LIGHTEST, _HEAVIEST)
+        if length_to_beat is None:
+            self._weights = generator.uniform(_LIGHTEST, _HEAVIEST)
+            self._max_depth = MAX_ACTIONS
+        else:
+            self._weights = generator.uniform(
+                _LIGHTEST_TO_IMPROVE, _HEAVIEST_TO_IMPROVE
+            )
+            self._max_depth = length_to_beat - 1
         capacity = _RESTART + NUM_ACTIONS + 1
-        self.states = np.empty((capacity, len(state)))
-        self._keys = np.empty((capacity, len(state)))
-        self._costs = np.empty(capacity)
+        self.nodes = Nodes(state, capacity)
+        self._costs = np.zeros(capacity)
         self._open = np.zeros(capacity, dtype=bool)
-        # Of each node: the node and action it came from, and how many actions ago
-        # the tree began.
-        self._parents: list[int] = []
-        self._actions: list[int] = []
-        self._depths: list[int] = []
-        # The transition of the search that each node is the end of, -1 for the root.
-        self.transitions: list[int] = []
-        self.add(state, -1, -1, -1)
+        self._open[0] = True
 
     def add(self, state: np.ndarray, parent: int, action: int, transition: int) -> bool:
         """Adds a node, unless it is too deep or the tree has nearly the same state."""
-        size = len(self._parents)
-        depth = self._depths[parent] + 1 if parent >= 0 else 0
-        if depth > MAX_ACTIONS:
+        depth = int(self.nodes.depths[parent]) + 1
+        if depth + fewest_actions_left(state, self.goals) > self._max_depth:
             return False
-        key = state.copy()
-        key[2::3] *= _ANGLE_LENGTH
-        distances = np.abs(self._keys[:size] - key).max(axis=1)
-        if size and distances.min() < _DUPLICATE_DISTANCE:
+        if self.nodes.has_near(state):
             return False
+        node = self.nodes.add(state, parent, action, transition)
         moved = np.linalg.norm(object_positions(state)[1:] - self.goals[1:], axis=1)
-        self.states[size] = state
-        self._keys[size] = key
-        self._costs[size] = (
+        self._costs[node] = (
             self._weights[1] * moved.sum() / TRANSLATION + self._weights[2] * depth
         )
-        self._open[size] = True
-        self._parents.append(parent)
-        self._actions.append(action)
-        self.transitions.append(transition)
-        self._depths.append(depth)
+        self._open[node] = True
         return True
 
     def pop_nearest(self, place: np.ndarray) -> int | None:
@@ -148,7 +151,7 @@ class _Tree:
         candidates = np.flatnonzero(self._open)
         if not len(candidates):
             return None
-        states = self.states[candidates]
+        states = self.nodes.states[candidates]
         targets = states[:, 3:5]
         distances = (
             np.linalg.norm(place - targets, axis=1) / TRANSLATION
@@ -159,14 +162,6 @@ class _Tree:
         self._open[node] = False
         return node
 
-    def plan_to_newest(self) -> tuple[np.ndarray, np.ndarray]:
-        """The actions (L,) and states (L + 1, 3 + 3 m) to the newest node."""
-        path = [len(self._parents) - 1]
-        while self._parents[path[-1]] >= 0:
-            path.append(self._parents[path[-1]])
-        path.reverse()
-        return np.array([self._actions[n] for n in path[1:]], int), self.states[path]
-
 
 def plan(
     push_model: PushModel,
@@ -175,10 +170,11 @@ def plan(
     generator: np.random.Generator,
     *,
     max_transitions: int = 1_000_000,
+    improvement: int = 0,
     time_limit: float = float("inf"),
     action_set: np.ndarray = HAND_ACTIONS,
 ) -> Plan:
-    """Grows a tree from `state` until a goal state is in it.
+    """Grows a tree from `state` until a goal state is in it, then tries to do better.
 
     Args:
         push_model: What the edges are simulated in.
@@ -186,15 +182,17 @@ def plan(
         goals: Shape (m, 2).
         generator: Draws the places that the tree grows to.
         max_transitions: Limit of simulated actions.
+        improvement: Actions to simulate, after a plan was found, for a shorter one.
         time_limit: Limit of computation, s.
         action_set: The actions to plan with.
     """
     begin = time.perf_counter()
     tree = _Tree(state, goals, generator)
     record = SearchRecord(len(state))
-    found = (np.empty(0, int), state[None]) if goals_reached(state, goals) else None
-    restart_at = _RESTART
-    while found is None and record.num_transitions < max_transitions:
+    best = (np.empty(0, int), state[None]) if goals_reached(state, goals) else None
+    length_to_beat = None
+    restart_at, stop_at = _RESTART, max_transitions if best is None else 0
+    while record.num_transitions < stop_at:
         if time.perf_counter() - begin > time_limit:
             break
         place = (
@@ -204,22 +202,33 @@ def plan(
         )
         node = tree.pop_nearest(place)
         if node is None or record.num_transitions >= restart_at:
-            tree = _Tree(state, goals, generator)
+            tree = _Tree(state, goals, generator, length_to_beat)
             restart_at = record.num_transitions + _RESTART
             continue
-        source = tree.states[node].copy()
+        source = tree.nodes.states[node]
         actions = action_set[allowed_actions(source, action_set)]
         if not len(actions):
             if node == 0:
                 break
             continue
-        children = push_model.step(np.repeat(source[None], len(actions), 0), actions)
-        indices = record.add(source, actions, children, tree.transitions[node])
+        sources = np.repeat(source[None], len(actions), axis=0)
+        children = push_model.step(sources, actions)
+        origins = np.repeat(tree.nodes.transitions[node], len(actions))
+        indices = record.add(sources, actions, children, origins)
         found = _grow(tree, node, actions, children, indices)
+        if found is None:
+            continue
+        if best is None:
+            stop_at = min(stop_at, record.num_transitions + improvement)
+        best, length_to_beat = found, len(found[0])
+        if length_to_beat <= fewest_actions_left(state, goals):
+            break
+        tree = _Tree(state, goals, generator, length_to_beat)
+        restart_at = record.num_transitions + _RESTART
     seconds = time.perf_counter() - begin
-    if found is None:
+    if best is None:
         return Plan(None, state[None], record.search(), seconds)
-    return Plan(*found, record.search(), seconds)
+    return Plan(*best, record.search(), seconds)
 
 
 def _grow(
@@ -230,12 +239,9 @@ def _grow(
     indices: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Adds a node's children, and returns the plan if one of them is a goal."""
-    moved = object_positions(children)[:, 1:] - tree.goals[1:]
-    lost = (np.linalg.norm(moved, axis=-1) > _OBSTACLE_LIMIT).any(axis=1)
-    lost |= objects_fallen(children)
-    for i in np.flatnonzero(~lost):
+    for i in np.flatnonzero(~hopeless(children, tree.goals)):
         child = children[i]
         added = tree.add(child, node, int(actions[i]), int(indices[i]))
         if added and goals_reached(child, tree.goals):
-            return tree.plan_to_newest()
+            return tree.nodes.path(len(tree.nodes) - 1)
     return None

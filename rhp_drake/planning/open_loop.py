@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rhp_drake.planning.kinodynamic_rrt import plan
+from rhp_drake.planning.kinodynamic_rrt import IMPROVEMENT, plan
 from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.push_model.transition import PushModel
 
@@ -31,7 +31,12 @@ class OpenLoop:
         """The plan's next action; see `policy.Policy`.  Plans at the first call."""
         if memory is None:
             found = plan(
-                self._push_model, state, goals, generator, time_limit=self._time_limit
+                self._push_model,
+                state,
+                goals,
+                generator,
+                improvement=IMPROVEMENT,
+                time_limit=self._time_limit,
             )
             if found.actions is None:
                 raise PolicyError(

@@ -1,8 +1,18 @@
-"""What was simulated in search of a plan, as data to learn from."""
+"""What planners share: a plan, what was simulated for it, and which states are new."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
+
+from rhp_drake.task import GOAL_RADIUS, object_positions, objects_fallen
+
+# m: an obstacle this far out of its region is as good as lost.
+_OBSTACLE_LIMIT: Final = 1.5 * GOAL_RADIUS
+# m: states closer than this in every coordinate are the same to a planner...
+_DUPLICATE_DISTANCE: Final = 0.012
+# ...with this many metres to a radian.
+_ANGLE_LENGTH: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -22,6 +32,23 @@ class Search:
     origins: np.ndarray
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a planner found.
+
+    Attributes:
+        actions: Shape (L,); None if no plan was found within the limits.
+        states: s_0 ... s_L, shape (L + 1, 3 + 3 m); s_0 alone without a plan.
+        search: All that was simulated, the children that were dropped included.
+        seconds: Time it took.
+    """
+
+    actions: np.ndarray | None
+    states: np.ndarray
+    search: Search
+    seconds: float
+
+
 class SearchRecord:
     """Collects what is simulated."""
 
@@ -34,20 +61,20 @@ class SearchRecord:
 
     def add(
         self,
-        state: np.ndarray,
+        states: np.ndarray,
         actions: np.ndarray,
-        children: np.ndarray,
-        origin: int,
+        next_states: np.ndarray,
+        origins: np.ndarray,
     ) -> np.ndarray:
-        """Adds the children (A, 3 + 3 m) that actions (A,) led to from one state.
+        """Adds A transitions, as `Search` describes them.
 
         Returns:
-            The transitions' indices, shape (A,).
+            Their indices, shape (A,).
         """
-        self._states.append(np.repeat(state[None], len(actions), axis=0))
+        self._states.append(states)
         self._actions.append(actions)
-        self._next_states.append(children)
-        self._origins.append(np.full(len(actions), origin))
+        self._next_states.append(next_states)
+        self._origins.append(origins)
         first = self.num_transitions
         self.num_transitions += len(actions)
         return np.arange(first, self.num_transitions)
@@ -60,3 +87,82 @@ class SearchRecord:
             np.concatenate(self._next_states),
             np.concatenate(self._origins),
         )
+
+
+class Nodes:
+    """The states that a search goes on from, each with the way to it.
+
+    Attributes:
+        states: Shape (N, 3 + 3 m).
+        depths: How many actions each is from the root, shape (N,).
+        transitions: The transition of the search record that ended there, -1 for the
+            root, shape (N,).
+    """
+
+    def __init__(self, root: np.ndarray, capacity: int) -> None:
+        self._states = np.empty((capacity, len(root)))
+        self._keys = np.empty((capacity, len(root)))
+        self._depths = np.zeros(capacity, dtype=int)
+        self._parents = np.full(capacity, -1)
+        self._actions = np.full(capacity, -1)
+        self._transitions = np.full(capacity, -1)
+        self._size = 1
+        self._states[0] = root
+        self._keys[0] = _key(root)
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def states(self) -> np.ndarray:  # noqa: D102
+        return self._states[: self._size]
+
+    @property
+    def depths(self) -> np.ndarray:  # noqa: D102
+        return self._depths[: self._size]
+
+    @property
+    def transitions(self) -> np.ndarray:  # noqa: D102
+        return self._transitions[: self._size]
+
+    def has_near(self, state: np.ndarray) -> bool:
+        """Whether nearly the same state is among them."""
+        distances = np.abs(self._keys[: self._size] - _key(state)).max(axis=1)
+        return bool(distances.min() < _DUPLICATE_DISTANCE)
+
+    def add(self, state: np.ndarray, parent: int, action: int, transition: int) -> int:
+        """Adds a state that an action led to; returns its number."""
+        node = self._size
+        self._states[node] = state
+        self._keys[node] = _key(state)
+        self._depths[node] = self._depths[parent] + 1
+        self._parents[node] = parent
+        self._actions[node] = action
+        self._transitions[node] = transition
+        self._size += 1
+        return node
+
+    def path(self, node: int) -> tuple[np.ndarray, np.ndarray]:
+        """The actions (L,) and states (L + 1, 3 + 3 m) from the root to a node."""
+        path = [node]
+        while self._parents[path[-1]] >= 0:
+            path.append(int(self._parents[path[-1]]))
+        path.reverse()
+        return self._actions[path[1:]], self._states[path]
+
+
+def _key(state: np.ndarray) -> np.ndarray:
+    key = state.copy()
+    key[2::3] *= _ANGLE_LENGTH
+    return key
+
+
+def hopeless(states: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """Whether no planner should go on from the states, booleans of shape (N,).
+
+    Args:
+        states: Shape (N, 3 + 3 m).
+        goals: Shape (m, 2).
+    """
+    moved = np.linalg.norm(object_positions(states)[:, 1:] - goals[1:], axis=-1)
+    return (moved > _OBSTACLE_LIMIT).any(axis=1) | objects_fallen(states)
