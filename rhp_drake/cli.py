@@ -7,6 +7,7 @@ import typer
 from rhp_drake.commands.bench import bench
 from rhp_drake.commands.evaluate import evaluate
 from rhp_drake.commands.learn import demos, fit, imitate
+from rhp_drake.commands.plan import plan
 from rhp_drake.commands.run import run
 from rhp_drake.errors import InputError
 
@@ -16,7 +17,7 @@ app = typer.Typer(
     # A traceback is for developers; it need not fill the screen with variables.
     pretty_exceptions_show_locals=False,
 )
-for command in (run, demos, imitate, fit, evaluate):
+for command in (run, plan, demos, imitate, fit, evaluate):
     app.command()(command)
 app.add_typer(bench, name="bench")
 

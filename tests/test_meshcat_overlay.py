@@ -5,8 +5,9 @@ import pytest
 from rhp_drake import task
 from rhp_drake.planning.policy import Decision
 from rhp_drake.random_streams import stream
-from rhp_drake.systems.meshcat_overlay import MeshcatOverlay, _ribbon
+from rhp_drake.systems.meshcat_overlay import MeshcatOverlay
 from rhp_drake.systems.receding_horizon_planner import NO_DECISION, DecisionRecord
+from rhp_drake.visualization import _bands
 
 
 class FakeMeshcat:
@@ -115,9 +116,9 @@ def test_real_meshcat(instance):
     assert "<html>" in meshcat.StaticHtml()
 
 
-def test_ribbon():
+def test_bands():
     points = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.0], [0.1, 0.2]])
-    vertices, faces = _ribbon(points, width=0.02, height=0.003)
+    vertices, faces = _bands(points[:-1], points[1:], width=0.02, height=0.003)
     assert vertices.shape == (3, 8)
     assert faces.shape == (3, 4)
     np.testing.assert_allclose(vertices[2], 0.003)
@@ -127,4 +128,4 @@ def test_ribbon():
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1) / 2
     assert areas.sum() == pytest.approx((0.1 + 0.02 + 0.2 + 0.02) * 0.02)
-    assert _ribbon(points[1:3], 0.02, 0.003)[1].size == 0
+    assert _bands(points[1:2], points[2:3], 0.02, 0.003)[1].size == 0

@@ -7,6 +7,7 @@ and "near" means near to having pushed it there: the hand counts by its pose rel
 to the node's own target object.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 import time
@@ -70,6 +71,28 @@ class Plan:
     seconds: float
 
 
+@dataclass(frozen=True)
+class Growth:
+    """How far a search has come, told after each node that it expands.
+
+    Attributes:
+        num_transitions: Actions simulated so far, in all trees.
+        num_trees: Trees begun so far.
+        num_nodes: Of the present tree.
+        nearest: The least distance from the target to its goal in any tree's state
+            that has every obstacle inside its region, m; inf if there is none.
+        source: The node that was expanded, shape (3 + 3 m,).
+        children: The nodes that the tree got from it, shape (k, 3 + 3 m).
+    """
+
+    num_transitions: int
+    num_trees: int
+    num_nodes: int
+    nearest: float
+    source: np.ndarray
+    children: np.ndarray
+
+
 def _wrap(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
@@ -118,6 +141,11 @@ class _Tree:
         # The transition of the search that each node is the end of, -1 for the root.
         self.transitions: list[int] = []
         self.add(state, -1, -1, -1)
+
+    @property
+    def num_nodes(self) -> int:
+        """The rows of `states` in use."""
+        return len(self._parents)
 
     def add(self, state: np.ndarray, parent: int, action: int, transition: int) -> bool:
         """Adds a node, unless it is too deep or the tree has nearly the same state."""
@@ -177,6 +205,7 @@ def plan(
     max_transitions: int = 1_000_000,
     time_limit: float = float("inf"),
     action_set: np.ndarray = HAND_ACTIONS,
+    on_growth: Callable[[Growth], None] | None = None,
 ) -> Plan:
     """Grows a tree from `state` until a goal state is in it.
 
@@ -188,12 +217,14 @@ def plan(
         max_transitions: Limit of simulated actions.
         time_limit: Limit of computation, s.
         action_set: The actions to plan with.
+        on_growth: Called after each node's expansion; it changes nothing.
     """
     begin = time.perf_counter()
     tree = _Tree(state, goals, generator)
     record = SearchRecord(len(state))
     found = (np.empty(0, int), state[None]) if goals_reached(state, goals) else None
     restart_at = _RESTART
+    num_trees, nearest = 1, _nearest(state[None], goals)
     while found is None and record.num_transitions < max_transitions:
         if time.perf_counter() - begin > time_limit:
             break
@@ -206,6 +237,7 @@ def plan(
         if node is None or record.num_transitions >= restart_at:
             tree = _Tree(state, goals, generator)
             restart_at = record.num_transitions + _RESTART
+            num_trees += 1
             continue
         source = tree.states[node].copy()
         actions = action_set[allowed_actions(source, action_set)]
@@ -215,11 +247,32 @@ def plan(
             continue
         children = push_model.step(np.repeat(source[None], len(actions), 0), actions)
         indices = record.add(source, actions, children, tree.transitions[node])
+        before = tree.num_nodes
         found = _grow(tree, node, actions, children, indices)
+        if on_growth is not None:
+            added = tree.states[before : tree.num_nodes].copy()
+            nearest = min(nearest, _nearest(added, goals))
+            on_growth(
+                Growth(
+                    record.num_transitions,
+                    num_trees,
+                    tree.num_nodes,
+                    nearest,
+                    source,
+                    added,
+                )
+            )
     seconds = time.perf_counter() - begin
     if found is None:
         return Plan(None, state[None], record.search(), seconds)
     return Plan(*found, record.search(), seconds)
+
+
+def _nearest(states: np.ndarray, goals: np.ndarray) -> float:
+    """`Growth.nearest` of states (N, 3 + 3 m)."""
+    distances = np.linalg.norm(object_positions(states) - goals, axis=-1)
+    inside = (distances[:, 1:] <= GOAL_RADIUS).all(axis=1)
+    return float(distances[inside, 0].min(initial=np.inf))
 
 
 def _grow(
