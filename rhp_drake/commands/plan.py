@@ -109,9 +109,9 @@ def _plan(
 
     def on_decision(record: "DecisionRecord") -> None:
         nonlocal shown
-        if planner.num_plans == shown:
+        if planner.num_searches == shown:
             return
-        shown = planner.num_plans
+        shown = planner.num_searches
         if drawing is not None:
             drawing.show_from(record.time)
         # Reality need not be caught up with after a long search.
@@ -129,7 +129,7 @@ def _plan(
     if run is None:
         console.print(f"Results: {folder}")
         return 0
-    if planner.num_plans == 0:
+    if planner.num_searches == 0:
         console.print("There is no plan: the search did not come to its end.")
     if execute:
         task_run.write_run(run, scenario, folder)
@@ -150,14 +150,14 @@ class _ShownPlanner:
         console: Where to say how the search comes on.
         drawing: Where to draw the tree, None for nowhere.
         folder: Of plan.json.
-        num_plans: How many there were.
+        num_searches: How many came to an end.
     """
 
     scenario: "Scenario"
     console: "Console"
     drawing: "TreeDrawing | None"
     folder: Path
-    num_plans: int = 0
+    num_searches: int = 0
 
     def __call__(
         self,
@@ -176,7 +176,8 @@ class _ShownPlanner:
         if self.drawing is not None:
             self.drawing.begin_search()
 
-        with self.console.status("Planning") as status:
+        # Not more often: it takes time from the search.
+        with self.console.status("Planning", refresh_per_second=4) as status:
 
             def on_growth(newest: "Growth") -> None:
                 nonlocal growth
@@ -197,13 +198,13 @@ class _ShownPlanner:
             self.drawing.draw()
         if growth is not None:
             self.console.print(_progress(growth, found.seconds))
-        if self.num_plans == 0:
+        if self.num_searches == 0:
             self._write(found, goals, growth)
             if found.actions is not None:
                 self.console.print(_make_table(found.actions, found.states, goals))
         elif found.actions is not None:
             self.console.print(f"A new plan of {len(found.actions)} actions.")
-        self.num_plans += 1
+        self.num_searches += 1
         return found
 
     def _write(
