@@ -13,7 +13,7 @@ def evaluate(
     *,
     policies: Annotated[
         str, typer.Option(help=f"Any of {', '.join(POLICIES)}.")
-    ] = "kdp,gp,rhp33,rhp66",
+    ] = "kdp,gp,rhp33,rhp66",  # Those of the paper.
     instances: Annotated[
         str, typer.Option(help="The set: evaluation (never tune on it) or validation.")
     ] = "validation",
