@@ -129,7 +129,8 @@ class TaskInstance:
 
 def object_positions(states: np.ndarray) -> np.ndarray:
     """Positions (..., m, 2) of the objects in states of shape (..., 3 + 3 m)."""
-    return states[..., 3:].reshape(*states.shape[:-1], -1, 3)[..., :2]
+    num_objects = states.shape[-1] // 3 - 1  # No -1 below: N may be 0.
+    return states[..., 3:].reshape(*states.shape[:-1], num_objects, 3)[..., :2]
 
 
 def goals_reached(states: np.ndarray, goals: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Meshcat for a run: where it listens, where its camera stands, how it is lit."""
+"""Meshcat for a run: its camera and light, and bands drawn on the table."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -58,3 +58,67 @@ def MakeMeshcat(config: VisualizationConfig) -> "Meshcat":
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "zoom", 2.1)
     meshcat.SetCameraPose(config.camera, config.camera_target)
     return meshcat
+
+
+def draw_bands(
+    meshcat: "Meshcat",
+    path: str,
+    begins: np.ndarray,
+    ends: np.ndarray,
+    color: np.ndarray,
+    width: float,
+    height: float,
+) -> None:
+    """Draws flat bands from points to points, as one object.
+
+    It is a mesh because WebGL draws all lines one pixel wide.  If no band has a
+    length, nothing is drawn.
+
+    Args:
+        meshcat: Where to draw.
+        path: What to call the object.
+        begins: Shape (k, 2), m in W.
+        ends: Shape (k, 2), m in W.
+        color: Red, green and blue, 0 to 1.
+        width: Of the bands, m.
+        height: Where they lie, m in W.
+    """
+    vertices, faces = _bands(begins, ends, width, height)
+    if faces.size:
+        # The browser takes the colors of vertices to be linear, all others not.
+        colors = np.repeat(color[:, None] ** 2.2, vertices.shape[1], axis=1)
+        meshcat.SetTriangleColorMesh(path, vertices, faces, colors)
+
+
+def _bands(
+    begins: np.ndarray, ends: np.ndarray, width: float, height: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The triangles of `draw_bands`.
+
+    Returns:
+        Vertices of shape (3, 4 s) and faces of shape (3, 2 s), where s counts the
+        bands that have a length.
+    """
+    along = ends - begins
+    length = np.linalg.norm(along, axis=1)
+    keep = length > 1e-4
+    begins, ends, along = begins[keep], ends[keep], along[keep]
+    # Half a width longer at both ends, so that bends have no gaps.
+    along_half = along / length[keep, None] * width / 2
+    across_half = along_half[:, ::-1] * [-1, 1]
+    begins, ends = begins - along_half, ends + along_half
+    corners = np.stack(
+        [
+            begins + across_half,
+            begins - across_half,
+            ends - across_half,
+            ends + across_half,
+        ],
+        axis=1,
+    ).reshape(-1, 2)
+    vertices = np.column_stack([corners, np.full(len(corners), height)]).T
+    first = 4 * np.arange(len(begins), dtype=np.int32)
+    faces = np.concatenate(
+        [[first, first + 1, first + 2], [first, first + 2, first + 3]], axis=1
+    )
+    return vertices, faces.astype(np.int32)

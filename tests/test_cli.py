@@ -7,7 +7,7 @@ import pytest
 from rhp_drake import cli
 from rhp_drake.value.q_network import QNetwork
 
-COMMANDS = ("run", "demos", "imitate", "fit", "evaluate", "bench")
+COMMANDS = ("run", "plan", "demos", "imitate", "fit", "evaluate", "bench")
 
 
 def rhp(monkeypatch, *arguments) -> int:

@@ -1,6 +1,6 @@
 """Demonstrations, imitation and fitted Q."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,17 +8,9 @@ import torch
 
 from rhp_drake.errors import InputError
 from rhp_drake.learning.augmentation import Symmetry
-from rhp_drake.learning.demonstrations import (
-    PLANS_PER_SHARD,
-    load_demonstrations,
-    make_demonstration,
-    make_demonstrations,
-    read_description,
-)
-from rhp_drake.learning.demonstrators import (
-    PlanningDemonstrator,
-    RecedingHorizonDemonstrator,
-)
+from rhp_drake.learning.demonstration_folder import demonstrate_tasks
+from rhp_drake.learning.demonstrations import load_demonstrations
+from rhp_drake.learning.demonstrators import PlanningDemonstrator
 from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, double_q_targets, sample
 from rhp_drake.learning.imitation import (
     ImitationConfig,
@@ -26,8 +18,7 @@ from rhp_drake.learning.imitation import (
     imitation_targets,
     return_of,
 )
-from rhp_drake.planning.search import Search
-from rhp_drake.push_model.transition import PushModel, PushModelError
+from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
     Action,
@@ -41,109 +32,10 @@ DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("demonstrations")
-    assert list(make_demonstrations(path, PLANS_PER_SHARD, DEMONSTRATOR, 1)) == [
-        0,
-        PLANS_PER_SHARD,
-    ]
-    return path
-
-
-@pytest.fixture(scope="module")
-def data(folder):
-    return load_demonstrations([folder])
-
-
-def test_interrupted_work_goes_on(folder):
-    shard = folder / "plans_00000.npz"
-    before = shard.stat().st_mtime_ns
-    (folder / "plans_00001.npz.123.tmp").write_bytes(b"half a shard")
-    assert list(make_demonstrations(folder, PLANS_PER_SHARD, DEMONSTRATOR, 1)) == [
-        PLANS_PER_SHARD
-    ]
-    assert shard.stat().st_mtime_ns == before
-    assert len(load_demonstrations([folder]).goals) == PLANS_PER_SHARD
-
-
-def test_a_folder_is_one_demonstrator_s(folder):
-    assert "seed=11" in read_description(folder)["demonstrator"]
-    other = PlanningDemonstrator(seed=12, num_objects=3)
-    with pytest.raises(InputError, match="seed=11"):
-        next(make_demonstrations(folder, PLANS_PER_SHARD, other, 1))
-
-
-@dataclass(frozen=True)
-class FailsAt:
-    """A demonstrator whose push model fails in one task."""
-
-    index: int
-
-    def demonstrate(self, index):
-        if index == self.index:
-            raise PushModelError("the solver gave up")
-        goals = np.zeros((3, 2))
-        search = Search(np.zeros((0, 12)), np.zeros(0), np.zeros((0, 12)), np.zeros(0))
-        return make_demonstration(goals, None, np.zeros((0, 12)), search)
-
-
-def test_a_failure_of_the_physics_costs_one_task(tmp_path, caplog):
-    list(make_demonstrations(tmp_path, PLANS_PER_SHARD, FailsAt(7), 1))
-    assert len(load_demonstrations([tmp_path]).goals) == PLANS_PER_SHARD - 1
-    assert "task 7 is left out: the solver gave up" in caplog.text
-
-
-def test_bad_demonstrations_are_named(tmp_path):
-    with pytest.raises(InputError, match="holds no demonstrations"):
-        load_demonstrations([tmp_path])
-    (tmp_path / "plans_00000.npz").write_bytes(b"not an archive")
-    with pytest.raises(InputError, match=r"plans_00000\.npz"):
-        load_demonstrations([tmp_path])
-
-
-def test_demonstrations_hold_plans_that_end_at_the_goal(data):
-    last = data.plan_actions_left == 1
-    assert last.sum() == data.solved.sum()
-    push_model = PushModel(3)
-    ends = push_model.step(
-        data.plan_states[last].astype(float), data.plan_actions[last].astype(int)
-    )
-    # Stored in single precision: an end on a region's border may be rounded out.
-    reached = goals_reached(ends, data.goals[data.plan_tasks[last]])
-    assert reached.mean() > 0.9
-
-
-def test_folders_join(folder, data):
-    both = load_demonstrations([folder, folder])
-    assert len(both.goals) == 2 * len(data.goals)
-    n = len(data.search_actions)
-    second = both.search_origins[n:]
-    np.testing.assert_array_equal(both.search_origins[:n], data.search_origins)
-    np.testing.assert_array_equal(second < 0, data.search_origins < 0)
-    linked = second >= 0
-    np.testing.assert_array_equal(
-        both.search_next_states[second[linked]], both.search_states[n:][linked]
-    )
-
-
-def test_rhp_demonstrates_with_all_its_roll_outs(tmp_path):
-    weights = tmp_path / "weights.safetensors"
-    torch.manual_seed(0)
-    QNetwork(3).save(weights)
-    made, again = (
-        RecedingHorizonDemonstrator(11, 3, weights).demonstrate(2) for _ in range(2)
-    )
-    for name, array in vars(made).items():
-        np.testing.assert_array_equal(array, getattr(again, name), err_msg=name)
-    pairs = np.column_stack([made.search_states, made.search_actions])
-    # Nothing twice, but for what single precision cannot tell apart.
-    assert len(np.unique(pairs, axis=0)) > 0.95 * len(pairs)
-    linked = made.search_origins >= 0
-    assert linked.any()
-    np.testing.assert_array_equal(
-        made.search_next_states[made.search_origins[linked]],
-        made.search_states[linked],
-    )
+    list(demonstrate_tasks(path, 25, DEMONSTRATOR, 1))
+    return load_demonstrations([path])
 
 
 def test_eq_2():

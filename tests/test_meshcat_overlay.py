@@ -3,10 +3,13 @@ from pydrake.geometry import Meshcat, MeshcatParams
 import pytest
 
 from rhp_drake import task
+from rhp_drake.commands.tree_drawing import TreeDrawing
 from rhp_drake.planning.policy import Decision
+from rhp_drake.planning.search import Growth
 from rhp_drake.random_streams import stream
-from rhp_drake.systems.meshcat_overlay import MeshcatOverlay, _ribbon
+from rhp_drake.systems.meshcat_overlay import MeshcatOverlay
 from rhp_drake.systems.receding_horizon_planner import NO_DECISION, DecisionRecord
+from rhp_drake.visualization import _bands
 
 
 class FakeMeshcat:
@@ -15,10 +18,11 @@ class FakeMeshcat:
     def __init__(self):
         self.paths = set()
         self.visible = {}
+        self.num_faces = {}
 
     def Delete(self, path):
         self.paths = {p for p in self.paths if not p.startswith(path)}
-        self.visible.clear()
+        self.visible = {p: v for p, v in self.visible.items() if not p.startswith(path)}
 
     def SetObject(self, path, shape, rgba):
         self.paths.add(path)
@@ -30,6 +34,7 @@ class FakeMeshcat:
         assert vertices.shape == colors.shape
         assert faces.max() < vertices.shape[1]
         self.paths.add(path)
+        self.num_faces[path] = faces.shape[1]
 
     def SetProperty(self, path, name, value, time_in_recording):
         assert name == "visible"
@@ -103,21 +108,65 @@ def test_discs_and_roll_outs(instance):
     assert meshcat.paths == discs
 
 
+def grow(state, tree, *, hand=0.0, target=0.0, count=1) -> Growth:
+    """A node with `count` children that have moved along x, m."""
+    children = np.repeat(state[None], count, axis=0)
+    children[:, [0, 3]] += [hand, target]
+    return Growth(0, tree, 0, 0.1, state, children, None)
+
+
+def test_tree_is_drawn_as_it_grows(instance):
+    meshcat, state = FakeMeshcat(), instance.initial_state
+    drawing = TreeDrawing(meshcat)
+    drawing.begin_search()
+    drawing.add(grow(state, 1, hand=0.05))  # The first is drawn at once...
+    assert meshcat.paths == {"/overlay/tree/1/1/hand"}
+    drawing.add(grow(state, 1, hand=0.05, target=0.04, count=2))
+    drawing.add(grow(state, 1, count=0))
+    drawing.add(grow(state, 1, target=0.04))
+    assert meshcat.paths == {"/overlay/tree/1/1/hand"}  # ...the next ones later.
+    drawing.draw()
+    drawing.draw()
+    second = {"/overlay/tree/1/2/hand": 4, "/overlay/tree/1/2/target": 6}
+    assert meshcat.num_faces == {"/overlay/tree/1/1/hand": 2, **second}
+
+    # Another tree takes the place of the first, another search that of this one.
+    drawing.add(grow(state, 2, hand=0.05))
+    drawing.draw()
+    assert meshcat.paths == {"/overlay/tree/1/3/hand"}
+    drawing.show_from(0.2)
+    drawing.begin_search()
+    drawing.add(grow(state, 1, hand=0.05))
+    drawing.draw()
+    drawing.show_from(0.9)
+    assert meshcat.paths == {"/overlay/tree/1/3/hand", "/overlay/tree/2/4/hand"}
+    assert meshcat.visible == {
+        "/overlay/tree/1": {0.0: False, 0.2: True, 0.9: False},
+        "/overlay/tree/2": {0.0: False, 0.9: True},
+    }
+
+
 def test_real_meshcat(instance):
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     overlay = MeshcatOverlay(meshcat, 3)
     meshcat.StartRecording()
     publish(overlay, instance, 0.0, record(instance, 0, 2), initialize=True)
     publish(overlay, instance, 0.1, record(instance, 1, 2))
+    drawing = TreeDrawing(meshcat)
+    drawing.begin_search()
+    drawing.add(grow(instance.initial_state, 1, hand=0.05, target=0.05))
+    drawing.draw()
+    drawing.show_from(0.1)
     meshcat.PublishRecording()
+    assert meshcat.HasPath("/overlay/tree/1/1/target")
     assert meshcat.HasPath("/overlay/goal/2/reached")
     assert meshcat.HasPath("/overlay/roll_outs/1/0/hand")
     assert "<html>" in meshcat.StaticHtml()
 
 
-def test_ribbon():
+def test_bands():
     points = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.0], [0.1, 0.2]])
-    vertices, faces = _ribbon(points, width=0.02, height=0.003)
+    vertices, faces = _bands(points[:-1], points[1:], width=0.02, height=0.003)
     assert vertices.shape == (3, 8)
     assert faces.shape == (3, 4)
     np.testing.assert_allclose(vertices[2], 0.003)
@@ -127,4 +176,4 @@ def test_ribbon():
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1) / 2
     assert areas.sum() == pytest.approx((0.1 + 0.02 + 0.2 + 0.02) * 0.02)
-    assert _ribbon(points[1:3], 0.02, 0.003)[1].size == 0
+    assert _bands(points[1:2], points[2:3], 0.02, 0.003)[1].size == 0

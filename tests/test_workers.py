@@ -1,9 +1,12 @@
+import os
+import signal
+
 import pytest
 import torch
 
-from rhp_drake.errors import InputError
+from rhp_drake.errors import InputError, WorkError
 from rhp_drake.random_streams import stream
-from rhp_drake.workers import run_over
+from rhp_drake.workers import RayCluster, run_over
 
 
 def multiply(index: int) -> list[float]:
@@ -19,9 +22,9 @@ def refuse(index: int) -> int:
 
 
 def test_results_do_not_depend_on_the_number_of_workers():
-    alone = dict(run_over(multiply, range(4), num_workers=1))
+    alone = dict(run_over(multiply, range(4), workers=1))
     assert list(alone) == [0, 1, 2, 3]
-    assert dict(run_over(multiply, range(4), num_workers=2)) == alone
+    assert dict(run_over(multiply, range(4), workers=2)) == alone
 
 
 @pytest.mark.parametrize("num_workers", [1, 2])
@@ -31,4 +34,21 @@ def test_errors_come_back(num_workers):
 
 
 def test_nothing_to_do():
-    assert list(run_over(refuse, [], num_workers=2)) == []
+    assert list(run_over(refuse, [], workers=2)) == []
+
+
+def die(index: int) -> int:
+    if index == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return index
+
+
+def test_a_killed_worker_is_one_sentence():
+    with pytest.raises(WorkError, match="a worker process died"):
+        list(run_over(die, range(3), workers=2))
+
+
+def test_a_cluster_that_is_not_there():
+    pytest.importorskip("ray")
+    with pytest.raises(InputError, match=r"no Ray cluster at 'nowhere'"):
+        list(run_over(refuse, range(3), RayCluster("nowhere")))

@@ -53,6 +53,7 @@ def _run(trial: PlanningTrial, seed: int) -> PlanningResult:
         instance.goals,
         stream(seed, VALIDATION, trial.index, "action_frames"),
         max_transitions=_MAX_TRANSITIONS,
+        improvement=0,
         action_set=ACTION_SETS[trial.frame],
     )
     num_actions = 0 if found.actions is None else len(found.actions)

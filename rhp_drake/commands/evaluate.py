@@ -6,14 +6,14 @@ from typing import Annotated
 import typer
 
 from rhp_drake.errors import InputError
-from rhp_drake.planning.policy_config import PAPER_POLICIES, PolicyConfig
+from rhp_drake.planning.policy_config import POLICIES, PolicyConfig
 
 
 def evaluate(
     *,
     policies: Annotated[
-        str, typer.Option(help=f"Any of {', '.join(PAPER_POLICIES)}.")
-    ] = ",".join(PAPER_POLICIES),
+        str, typer.Option(help=f"Any of {', '.join(POLICIES)}.")
+    ] = "kdp,gp,rhp33,rhp66",  # Those of the paper.
     instances: Annotated[
         str, typer.Option(help="The set: evaluation (never tune on it) or validation.")
     ] = "validation",
@@ -69,12 +69,10 @@ def evaluate(
 
 
 def _config(name: str, weights: str | None, temperature: float | None) -> PolicyConfig:
-    """The named policy of the paper, with other weights or temperature."""
-    if name not in PAPER_POLICIES:
-        raise InputError(
-            f"--policies: {name!r} is not one of {', '.join(PAPER_POLICIES)}."
-        )
-    config = PAPER_POLICIES[name]()
+    """The named policy, with other weights or temperature."""
+    if name not in POLICIES:
+        raise InputError(f"--policies: {name!r} is not one of {', '.join(POLICIES)}.")
+    config = POLICIES[name]()
     if weights is not None and hasattr(config, "q_network"):
         config.q_network = weights
     if temperature is not None and hasattr(config, "temperature"):

@@ -108,7 +108,7 @@ def to_table(
 def _lists(arrays: list[np.ndarray], dtype: type) -> pa.Array:
     """A column of lists: of numbers, or of rows of numbers."""
     offsets = np.cumsum([0, *map(len, arrays)], dtype=np.int32)
-    values = np.concatenate(arrays).astype(dtype)
+    values: np.ndarray = np.concatenate(arrays).astype(dtype)
     flat = pa.array(values) if values.ndim == 1 else _fixed_lists(values)
     return pa.ListArray.from_arrays(pa.array(offsets), flat)
 

@@ -7,6 +7,7 @@ number alone, the folder comes out the same, `seconds` aside, whoever worked on 
 """
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from functools import partial
 import json
 import logging
@@ -99,8 +100,11 @@ _residents: dict[str, Demonstrator] = {}
 def _demonstrate(task: int, demonstrator: Demonstrator) -> Demonstration:
     begin = time.perf_counter()
     try:
-        resident = _residents.setdefault(repr(demonstrator), demonstrator)
-        return resident.demonstrate(task)
+        key = repr(demonstrator)
+        if key not in _residents:
+            # A copy: with a push model, the original could not be sent any more.
+            _residents[key] = copy(demonstrator)
+        return _residents[key].demonstrate(task)
     except PushModelError as error:
         # One state that the solver cannot handle must not stop days of work.
         instance = training_task(demonstrator.seed, task, demonstrator.num_objects)

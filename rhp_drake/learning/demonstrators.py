@@ -10,7 +10,7 @@ import numpy as np
 
 from rhp_drake.learning.demonstration import Demonstration, training_task
 from rhp_drake.planning.best_first import plan_best_first
-from rhp_drake.planning.kinodynamic_rrt import IMPROVEMENT, plan
+from rhp_drake.planning.kinodynamic_rrt import plan
 from rhp_drake.planning.policy import PolicyError
 from rhp_drake.planning.receding_horizon import RecedingHorizon, ValueFunction
 from rhp_drake.planning.search import Plan, Search, SearchRecord
@@ -56,7 +56,6 @@ class PlanningDemonstrator:
             instance.goals,
             stream(self.seed, TRAINING, task, "kinodynamic_rrt"),
             max_transitions=_MAX_TRANSITIONS,
-            improvement=IMPROVEMENT,
         )
         return _demonstration(self.seed, task, instance, found)
 

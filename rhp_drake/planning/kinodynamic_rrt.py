@@ -12,13 +12,14 @@ Ferguson and Stentz 2006).  To leave out actions of the plan and simulate the re
 saved half as many actions for the same number of transitions.
 """
 
+from collections.abc import Callable
 import math
 import time
 from typing import Final
 
 import numpy as np
 
-from rhp_drake.planning.search import Nodes, Plan, SearchRecord, hopeless
+from rhp_drake.planning.search import Growth, Nodes, Plan, SearchRecord, hopeless
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
@@ -170,9 +171,10 @@ def plan(
     generator: np.random.Generator,
     *,
     max_transitions: int = 1_000_000,
-    improvement: int = 0,
+    improvement: int = IMPROVEMENT,
     time_limit: float = float("inf"),
     action_set: np.ndarray = HAND_ACTIONS,
+    on_growth: Callable[[Growth], None] | None = None,
 ) -> Plan:
     """Grows a tree from `state` until a goal state is in it, then tries to do better.
 
@@ -185,6 +187,7 @@ def plan(
         improvement: Actions to simulate, after a plan was found, for a shorter one.
         time_limit: Limit of computation, s.
         action_set: The actions to plan with.
+        on_growth: Called after each node's expansion; it changes nothing.
     """
     begin = time.perf_counter()
     tree = _Tree(state, goals, generator)
@@ -192,6 +195,7 @@ def plan(
     best = (np.empty(0, int), state[None]) if goals_reached(state, goals) else None
     length_to_beat = None
     restart_at, stop_at = _RESTART, max_transitions if best is None else 0
+    num_trees, nearest = 1, _nearest(state[None], goals)
     while record.num_transitions < stop_at:
         if time.perf_counter() - begin > time_limit:
             break
@@ -204,6 +208,7 @@ def plan(
         if node is None or record.num_transitions >= restart_at:
             tree = _Tree(state, goals, generator, length_to_beat)
             restart_at = record.num_transitions + _RESTART
+            num_trees += 1
             continue
         source = tree.nodes.states[node]
         actions = action_set[allowed_actions(source, action_set)]
@@ -215,20 +220,44 @@ def plan(
         children = push_model.step(sources, actions)
         origins = np.repeat(tree.nodes.transitions[node], len(actions))
         indices = record.add(sources, actions, children, origins)
+        before = len(tree.nodes)
         found = _grow(tree, node, actions, children, indices)
+        if found is not None:
+            if best is None:
+                stop_at = min(stop_at, record.num_transitions + improvement)
+            best, length_to_beat = found, len(found[0])
+        if on_growth is not None:
+            added = tree.nodes.states[before:]
+            nearest = min(nearest, _nearest(added, goals))
+            on_growth(
+                Growth(
+                    record.num_transitions,
+                    num_trees,
+                    len(tree.nodes),
+                    nearest,
+                    source,
+                    added,
+                    length_to_beat,
+                )
+            )
         if found is None:
             continue
-        if best is None:
-            stop_at = min(stop_at, record.num_transitions + improvement)
-        best, length_to_beat = found, len(found[0])
-        if length_to_beat <= fewest_actions_left(state, goals):
+        if len(found[0]) <= fewest_actions_left(state, goals):
             break
         tree = _Tree(state, goals, generator, length_to_beat)
         restart_at = record.num_transitions + _RESTART
+        num_trees += 1
     seconds = time.perf_counter() - begin
     if best is None:
         return Plan(None, state[None], record.search(), seconds)
     return Plan(*best, record.search(), seconds)
+
+
+def _nearest(states: np.ndarray, goals: np.ndarray) -> float:
+    """`Growth.nearest` of states (N, 3 + 3 m)."""
+    distances = np.linalg.norm(object_positions(states) - goals, axis=-1)
+    inside = (distances[:, 1:] <= GOAL_RADIUS).all(axis=1)
+    return float(distances[inside, 0].min(initial=np.inf))
 
 
 def _grow(

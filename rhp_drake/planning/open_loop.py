@@ -1,12 +1,41 @@
 """KDP as a policy: the kinodynamic RRT's plan, executed open loop."""
 
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from rhp_drake.planning.kinodynamic_rrt import IMPROVEMENT, plan
+from rhp_drake.planning.kinodynamic_rrt import plan
 from rhp_drake.planning.policy import Decision, PolicyError
+from rhp_drake.planning.search import Plan
 from rhp_drake.push_model.transition import PushModel
+
+# Plans with a push model, state, goals, generator and time_limit (by name), as
+# `kinodynamic_rrt.plan` does.
+Planner: TypeAlias = Callable[..., Plan]
+
+
+@dataclass(frozen=True)
+class PlanRest:
+    """What is left of a plan: the memory of policies that execute one.
+
+    Attributes:
+        actions: Shape (L,).
+        states: Where the plan expects to be before each action and at the end, shape
+            (L + 1, 3 + 3 m).
+    """
+
+    actions: np.ndarray
+    states: np.ndarray
+
+    def decision(self) -> Decision:
+        """The next action, of L > 0; the plan's rest is its one roll-out."""
+        value = -float(len(self.actions))
+        rest = PlanRest(self.actions[1:], self.states[1:])
+        return Decision(
+            int(self.actions[0]), value, self.states[None], np.array([value]), rest
+        )
 
 
 class OpenLoop:
@@ -15,11 +44,15 @@ class OpenLoop:
     Args:
         push_model: What it plans in.
         time_limit: Limit of computation, s.
+        planner: Makes the plan.
     """
 
-    def __init__(self, push_model: PushModel, time_limit: float = 120.0) -> None:
+    def __init__(
+        self, push_model: PushModel, time_limit: float = 120.0, planner: Planner = plan
+    ) -> None:
         self._push_model = push_model
         self._time_limit = time_limit
+        self._planner = planner
 
     def decide(
         self,
@@ -30,19 +63,14 @@ class OpenLoop:
     ) -> Decision:
         """The plan's next action; see `policy.Policy`.  Plans at the first call."""
         if memory is None:
-            found = plan(
-                self._push_model,
-                state,
-                goals,
-                generator,
-                improvement=IMPROVEMENT,
-                time_limit=self._time_limit,
+            found = self._planner(
+                self._push_model, state, goals, generator, time_limit=self._time_limit
             )
             if found.actions is None:
                 raise PolicyError(
                     f"the planner found no plan in {found.seconds:.0f} s."
                 )
-            memory = tuple(found.actions)
-        if not memory:
+            memory = PlanRest(found.actions, found.states)
+        if not len(memory.actions):
             raise PolicyError("the plan has ended and the goal is not reached.")
-        return Decision(int(memory[0]), -float(len(memory)), memory=memory[1:])
+        return memory.decision()

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from rhp_drake import task
 from rhp_drake.systems.receding_horizon_planner import NO_DECISION
-from rhp_drake.visualization import FRAME_PERIOD
+from rhp_drake.visualization import FRAME_PERIOD, draw_bands
 
 if TYPE_CHECKING:
     from rhp_drake.planning.policy import Decision
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 PATH: Final = "/overlay"
 TARGET_COLOR: Final = (0.20, 0.66, 0.33)
 OBSTACLE_COLOR: Final = (0.80, 0.16, 0.14)
-_HAND_COLOR: Final = np.array([0.10, 0.32, 0.72])
+HAND_COLOR: Final = (0.10, 0.32, 0.72)
 _PALE: Final = 0.35  # How far towards white the roll-outs not chosen are drawn.
 _OPACITY: Final = 0.3  # Of the goal regions.
 # Heights above the table, m, far enough apart not to flicker.
@@ -114,7 +114,10 @@ class MeshcatOverlay(LeafSystem):
         for rank, i in enumerate(order):
             best = rank == len(order) - 1
             self._DrawPath(
-                f"{path}/{i}/hand", decision.roll_outs[i, :, :2], _HAND_COLOR, best
+                f"{path}/{i}/hand",
+                decision.roll_outs[i, :, :2],
+                np.array(HAND_COLOR),
+                best,
             )
             self._DrawPath(
                 f"{path}/{i}/target",
@@ -131,19 +134,12 @@ class MeshcatOverlay(LeafSystem):
     def _DrawPath(
         self, path: str, points: np.ndarray, color: np.ndarray, best: bool
     ) -> None:
-        """Draws a ribbon on the table through `points`, shape (k, 2), m in W.
-
-        It is a mesh because WebGL draws all lines one pixel wide.
-        """
+        """Draws a band on the table through `points`, shape (k, 2), m in W."""
         width = _BEST_WIDTH if best else _PATH_WIDTH
         height = _BEST_HEIGHT if best else _PATH_HEIGHT
         if not best:
             color = color + _PALE * (1 - color)
-        vertices, faces = _ribbon(points, width, height)
-        if faces.size:
-            # The browser takes the colors of vertices to be linear, all others not.
-            colors = np.repeat(color[:, None] ** 2.2, vertices.shape[1], axis=1)
-            self._meshcat.SetTriangleColorMesh(path, vertices, faces, colors)
+        draw_bands(self._meshcat, path, points[:-1], points[1:], color, width, height)
 
 
 def _disc_path(index: int) -> str:
@@ -152,42 +148,3 @@ def _disc_path(index: int) -> str:
 
 def _path(index: int) -> str:
     return f"{PATH}/roll_outs/{index}"
-
-
-def _ribbon(
-    points: np.ndarray, width: float, height: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """A flat band along a polyline, as triangles.
-
-    Args:
-        points: Shape (k, 2), m.
-        width: m.
-        height: Of the band, m.
-
-    Returns:
-        Vertices of shape (3, 4 s) and faces of shape (3, 2 s), where s counts the
-        segments that have a length.
-    """
-    start, along = points[:-1], np.diff(points, axis=0)
-    length = np.linalg.norm(along, axis=1)
-    keep = length > 1e-4
-    start, along = start[keep], along[keep]
-    # Half a width longer at both ends, so that bends have no gaps.
-    along_half = along / length[keep, None] * width / 2
-    across_half = along_half[:, ::-1] * [-1, 1]
-    begin, end = start - along_half, start + along + along_half
-    corners = np.stack(
-        [
-            begin + across_half,
-            begin - across_half,
-            end - across_half,
-            end + across_half,
-        ],
-        axis=1,
-    ).reshape(-1, 2)
-    vertices = np.column_stack([corners, np.full(len(corners), height)]).T
-    first = 4 * np.arange(len(start), dtype=np.int32)
-    faces = np.concatenate(
-        [[first, first + 1, first + 2], [first, first + 2, first + 3]], axis=1
-    )
-    return vertices, faces.astype(np.int32)

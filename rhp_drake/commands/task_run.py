@@ -1,0 +1,205 @@
+"""What `rhp run` and `rhp plan` share: one task in closed loop, told and recorded."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+import logging
+import math
+from pathlib import Path
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+# Drake and torch are imported in the functions, so that `rhp --help` is quick.
+if TYPE_CHECKING:
+    from pydrake.geometry import Meshcat
+    from pydrake.systems.analysis import Simulator
+    from rich.console import Console
+
+    from rhp_drake.closed_loop import Outcome
+    from rhp_drake.planning.policy import Policy
+    from rhp_drake.scenario import Scenario
+    from rhp_drake.systems.receding_horizon_planner import DecisionRecord
+
+INTERRUPTED: Final = "interrupted"
+
+
+@dataclass(frozen=True)
+class TaskRun:
+    """What happened.
+
+    Attributes:
+        outcome: How it ended; its status is `INTERRUPTED` after Ctrl-C.
+        decisions: All of them, in order.
+        times: What the clock on the wall said.
+    """
+
+    outcome: "Outcome"
+    decisions: "list[DecisionRecord]"
+    times: dict[str, Any]
+
+
+def default_folder() -> Path:
+    """A new name for each run, which sorts by time."""
+    return Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
+
+
+def make_console() -> "Console":
+    """Where a run is told."""
+    from rich.console import Console
+
+    # No markup: a message may well have brackets of its own.
+    return Console(highlight=False, markup=False, soft_wrap=True)
+
+
+def start_meshcat(scenario: "Scenario") -> "Meshcat":
+    """Meshcat as the scenario wants it; see `MakeMeshcat`."""
+    from rhp_drake.visualization import MakeMeshcat
+
+    # Drake announces Meshcat's address; so do we.
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    return MakeMeshcat(scenario.visualization)
+
+
+def make_simulator(
+    scenario: "Scenario", policy: "Policy", meshcat: "Meshcat | None", realtime: bool
+) -> "Simulator":
+    """A simulator of the closed loop; see `MakeClosedLoop`."""
+    from pydrake.systems.analysis import Simulator
+
+    from rhp_drake.closed_loop import MakeClosedLoop
+
+    simulator = Simulator(MakeClosedLoop(scenario, policy, meshcat))
+    if realtime:
+        simulator.set_target_realtime_rate(1.0)
+    return simulator
+
+
+def say_title(
+    console: "Console", title: str, scenario: "Scenario", meshcat: "Meshcat | None"
+) -> None:
+    """Says what is about to run, and where to look."""
+    console.print(f"{title}, seed {scenario.seed}", style="bold")
+    if scenario.description:
+        console.print(scenario.description)
+    if meshcat is not None:
+        console.print(f"Meshcat: {meshcat.web_url()}")
+
+
+@contextmanager
+def recorded(meshcat: "Meshcat | None", folder: Path) -> Iterator[None]:
+    """Records what happens, and writes it to recording.html in `folder`."""
+    from rhp_drake.files import write_atomically
+    from rhp_drake.visualization import FRAME_PERIOD
+
+    if meshcat is None:
+        yield
+        return
+    meshcat.StartRecording(frames_per_second=1 / FRAME_PERIOD)
+    yield
+    meshcat.StopRecording()
+    meshcat.PublishRecording()
+    write_atomically(folder / "recording.html", meshcat.StaticHtml())
+
+
+def run_task(
+    simulator: "Simulator",
+    scenario: "Scenario",
+    console: "Console",
+    on_decision: "Callable[[DecisionRecord], None]" = lambda record: None,
+) -> TaskRun:
+    """Runs the scenario's task to its end, or to the user's, and says each decision.
+
+    Args:
+        simulator: From `make_simulator`, for the same scenario.
+        scenario: Says which task and physics.
+        console: Where to say it.
+        on_decision: Called soon after each decision, before it is said.
+    """
+    from rhp_drake.closed_loop import Outcome, run_closed_loop
+    from rhp_drake.physics import draw_physics
+    from rhp_drake.random_streams import stream
+    from rhp_drake.scenario import make_task_instance
+
+    instance = make_task_instance(scenario)
+    physics = draw_physics(
+        scenario.world_physics,
+        instance.initial_state,
+        stream(scenario.seed, "world_physics"),
+    )
+    decisions: list[DecisionRecord] = []
+
+    def note_decision(record: "DecisionRecord") -> None:
+        decisions.append(record)
+        on_decision(record)
+        if record.index == 0:
+            heading = "  #  action             value  thought     to goal"
+            console.print(heading, style="dim")
+        console.print(_decision_line(record))
+
+    started, clock = datetime.now().astimezone(), time.perf_counter()
+    try:
+        outcome = run_closed_loop(
+            simulator,
+            instance,
+            physics,
+            seed=scenario.seed,
+            time_limit=scenario.time_limit,
+            on_decision=note_decision,
+        )
+    except KeyboardInterrupt:
+        # What has happened so far is worth keeping.
+        outcome = Outcome(
+            status=INTERRUPTED,
+            message="stopped by the user.",
+            num_actions=len(decisions),
+            time=simulator.get_context().get_time(),
+            target_distance=decisions[-1].target_distance if decisions else math.nan,
+        )
+    seconds = time.perf_counter() - clock
+    times = {"started": started.isoformat(timespec="seconds"), "seconds": seconds}
+    return TaskRun(outcome, decisions, times)
+
+
+def write_run(run: TaskRun, scenario: "Scenario", folder: Path) -> None:
+    """Writes run.json to `folder`."""
+    from rhp_drake.run_record import make_run_record, write_record
+
+    record = make_run_record(scenario, run.decisions, run.outcome, run.times)
+    write_record(folder / "run.json", record)
+
+
+def say_outcome(console: "Console", run: TaskRun, folder: Path) -> None:
+    """Says how it ended, and where the results are."""
+    outcome = run.outcome
+    console.print(
+        f"{outcome.status.replace('_', ' ').capitalize()}: {outcome.message}",
+        style="bold green" if outcome.succeeded else "bold red",
+    )
+    text = (
+        f"{outcome.num_actions} actions, {outcome.time:.1f} s simulated in "
+        f"{run.times['seconds']:.1f} s"
+    )
+    # Ctrl-C may come before anything was measured.
+    if math.isfinite(outcome.target_distance):
+        text += f", target {100 * outcome.target_distance:.1f} cm from its goal"
+    console.print(f"{text}.")
+    console.print(f"Results: {folder}")
+
+
+def exit_status(outcome: "Outcome") -> int:
+    """0 for success, 1 for failure, and what a shell reports for Ctrl-C."""
+    if outcome.status == INTERRUPTED:
+        return 130
+    return 0 if outcome.succeeded else 1
+
+
+def _decision_line(record: "DecisionRecord") -> str:
+    """A decision in one line."""
+    from rhp_drake.task import Action
+
+    action = Action(record.decision.action).name.lower()
+    return (
+        f"{record.index + 1:3}  {action:16} {record.decision.value:7.2f} "
+        f"{record.milliseconds:5.0f} ms  {100 * record.target_distance:7.1f} cm"
+    )

@@ -1,0 +1,88 @@
+"""Best-first search guided by a value function."""
+
+import numpy as np
+import pytest
+import torch
+
+from rhp_drake.planning.best_first import plan_best_first
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.random_streams import TRAINING, stream
+from rhp_drake.resources import models_path
+from rhp_drake.task import allowed_actions, goals_reached, sample_instance
+from rhp_drake.value.q_network import QNetwork, load_q_network
+
+
+@pytest.fixture(scope="module")
+def push_model():
+    return PushModel(3)
+
+
+@pytest.fixture(scope="module")
+def q_network():
+    return load_q_network(models_path() / "q_network/three_boxes.safetensors", 3)
+
+
+def test_plans_lead_to_the_goal_when_replayed(push_model, q_network):
+    for index in range(8):
+        instance = sample_instance(stream(5, TRAINING, index))
+        found = plan_best_first(
+            push_model, q_network, instance.initial_state, instance.goals
+        )
+        state = instance.initial_state
+        for action, expected in zip(found.actions, found.states[1:], strict=True):
+            assert not goals_reached(state, instance.goals)
+            assert allowed_actions(state)[action]
+            state = push_model.step(state[None], np.array([action]))[0]
+            # A batch may hold the pair at another place.
+            np.testing.assert_array_equal(state, expected)
+        assert goals_reached(state, instance.goals)
+        s = found.search
+        for before, origin in zip(s.states, s.origins, strict=True):
+            expected = instance.initial_state if origin < 0 else s.next_states[origin]
+            np.testing.assert_array_equal(before, expected)
+
+
+class Favourite:
+    """A value function that sees one action left, if it is this one."""
+
+    def __init__(self, action):
+        self._action = action
+
+    def values(self, states, goals):
+        q = np.full((len(states), 6), -30.0)
+        q[:, self._action] = -1.0
+        return q
+
+
+def test_the_most_promising_action_is_simulated_first(push_model):
+    instance = sample_instance(stream(5, TRAINING, 0))
+    found = plan_best_first(
+        push_model,
+        Favourite(4),
+        instance.initial_state,
+        instance.goals,
+        max_transitions=12,
+    )
+    # The root's six actions are simulated together; then the favourite's own.
+    assert found.search.actions[0] == 4
+    assert found.search.origins[6] == 0
+    assert found.search.actions[6] == 4
+
+
+def test_limits(push_model):
+    torch.manual_seed(0)
+    untrained = QNetwork(3)
+    instance = sample_instance(stream(5, TRAINING, 1))
+    arguments = (push_model, untrained, instance.initial_state, instance.goals)
+    found = plan_best_first(*arguments, max_transitions=30)
+    assert len(found.search.actions) < 30 + 6
+    found = plan_best_first(*arguments, time_limit=0.0)
+    assert found.actions is None
+    np.testing.assert_array_equal(found.states, instance.initial_state[None])
+
+
+def test_a_goal_state_needs_no_actions(push_model, q_network):
+    instance = sample_instance(stream(5, TRAINING, 1))
+    goals = instance.initial_state[3:].reshape(-1, 3)[:, :2]
+    found = plan_best_first(push_model, q_network, instance.initial_state, goals)
+    assert len(found.actions) == 0

@@ -1,0 +1,135 @@
+"""`rhp plan` as its user meets it."""
+
+import json
+
+import pytest
+
+from rhp_drake import cli
+
+EASY = """
+easy:
+  task: !Layout
+    hand: {position: [0.35, 0.0]}
+    target: {position: [0.42, 0.0]}
+    goal: [0.56, 0.0]
+    obstacles:
+      - position: [0.3, 0.2]
+      - position: [0.3, -0.2]
+"""
+PLAN = "rhp_drake.planning.kinodynamic_rrt.plan"
+
+
+@pytest.fixture
+def rhp(monkeypatch, tmp_path):
+    """Runs rhp on the easy scenario in this process; returns the exit status."""
+    (tmp_path / "easy.yaml").write_text(EASY)
+
+    def run_rhp(command, *arguments):
+        scenario = str(tmp_path / "easy.yaml")
+        monkeypatch.setattr("sys.argv", ["rhp", command, scenario, *arguments])
+        with pytest.raises(SystemExit) as info:
+            cli.main()
+        return info.value.code or 0
+
+    monkeypatch.chdir(tmp_path)
+    return run_rhp
+
+
+def read(path) -> dict:
+    """A plan.json or run.json without its times."""
+    record = json.loads(path.read_text())
+    del record["times"]
+    for decision in record.get("decisions", ()):
+        del decision["milliseconds"]
+    return record
+
+
+def names(folder) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_same_seed_same_plan(rhp, tmp_path, capsys):
+    options = ("--no-meshcat", "--no-execute")
+    for out in ("a", "b"):
+        assert rhp("plan", *options, "--seed", "1", "--out", out) == 0
+        assert names(tmp_path / out) == ["plan.json"]
+    a, b = (read(tmp_path / out / "plan.json") for out in "ab")
+    assert a == b
+    assert a["seed"] == 1
+    assert a["scenario"]["policy"] == {"_tag": "!OpenLoopConfig", "time_limit": 120.0}
+    assert len(a["states"]) == len(a["actions"]) + 1
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    last = f"{len(a['actions'])}   {a['actions'][-1]}"
+    assert last in printed.out
+    assert "1 tree, target at best" in printed.out
+
+
+@pytest.mark.parametrize("flag", ["--open-loop", "--checked"])
+def test_executes_the_plan_it_shows(flag, rhp, tmp_path, capsys):
+    options = ("--no-meshcat", "--no-realtime", "--out")
+    assert rhp("plan", flag, *options, "first") == 0
+    assert names(tmp_path / "first") == ["plan.json", "run.json"]
+    shown = read(tmp_path / "first" / "plan.json")
+    run = read(tmp_path / "first" / "run.json")
+    executed = [decision["action"] for decision in run["decisions"]]
+    assert executed == shown["actions"]
+    assert run["decisions"][0]["state"] == shown["states"][0]
+    assert run["scenario"] == shown["scenario"]
+    assert "Succeeded: all objects are at their goals." in capsys.readouterr().out
+    # Its record is the scenario of the same run.
+    (tmp_path / "easy.yaml").write_text((tmp_path / "first" / "run.json").read_text())
+    assert rhp("run", "--name", "scenario", *options, "again") == 0
+    assert read(tmp_path / "again" / "run.json") == run
+
+
+def test_recording_shows_the_tree(rhp, tmp_path, monkeypatch, capsys):
+    drawn = []
+    monkeypatch.setattr(
+        "rhp_drake.commands.tree_drawing.draw_bands",
+        lambda meshcat, path, *arguments: drawn.append(path),
+    )
+    assert rhp("plan", "--no-execute", "--out", "out") == 0
+    assert names(tmp_path / "out") == ["plan.json", "recording.html"]
+    assert "Meshcat: http://localhost:" in capsys.readouterr().out
+    assert "/overlay/tree/1/1/target" in drawn
+
+
+def test_no_plan(rhp, tmp_path, capsys):
+    assert rhp("plan", "--no-meshcat", "--time-limit", "1e-9", "--out", "out") == 1
+    assert "no plan" in capsys.readouterr().out
+    shown = read(tmp_path / "out" / "plan.json")
+    assert shown["actions"] is None
+    assert len(shown["states"]) == 1
+    assert read(tmp_path / "out" / "run.json")["outcome"]["status"] == "policy_failed"
+
+
+def test_ctrl_c_in_the_search(rhp, tmp_path, monkeypatch, capsys):
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PLAN, interrupted)
+    assert rhp("plan", "--no-meshcat", "--no-execute", "--out", "out") == 130
+    printed = capsys.readouterr().out
+    assert "There is no plan: the search did not come to its end." in printed
+    assert "Interrupted: stopped by the user." in printed
+    assert names(tmp_path / "out") == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--name", "hard"], "has no scenario 'hard', only easy."),
+        (["--seed", "-1"], "easy: seed: must be at least 0, not -1."),
+        (["--time-limit", "0"], "policy.time_limit is 0.0; it must be above 0 and fin"),
+        (["--scenario-text", "{taks: 1}"], "taks: there is no such key"),
+        (["--out", "/dev/null/out"], "/dev/null/out: no folder can be made: "),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input(arguments, message, rhp, tmp_path, capsys):
+    assert rhp("plan", "--no-meshcat", *arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert names(tmp_path) == ["easy.yaml"]
