@@ -14,6 +14,13 @@ def evaluate(
     policies: Annotated[
         str, typer.Option(help=f"Any of {', '.join(POLICIES)}.")
     ] = "kdp,gp,rhp33,rhp66",  # Those of the paper.
+    levels: Annotated[
+        str,
+        typer.Option(
+            help="Of the uncertainty of the world's physics: any of none, low, medium, "
+            "high."
+        ),
+    ] = "none",
     instances: Annotated[
         str, typer.Option(help="The set: evaluation (never tune on it) or validation.")
     ] = "validation",
@@ -43,6 +50,7 @@ def evaluate(
 
     comparison = Comparison(
         {name: _config(name, weights, temperature) for name in policies.split(",")},
+        levels.split(","),
         instances,
         count,
         world,
@@ -58,6 +66,7 @@ def evaluate(
         track(trials, description="Episodes", total=total, console=console),
         key=lambda result: (
             list(comparison.policies).index(result[0].policy),
+            comparison.levels.index(result[0].level),
             result[0].index,
         ),
     )

@@ -10,11 +10,13 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from rhp_drake.errors import InputError
-from rhp_drake.evaluation.episode import Episode, run_episode
+from rhp_drake.evaluation.episode import Episode, PushWorld, run_episode
 from rhp_drake.evaluation.statistics import format_rate
 from rhp_drake.frozen_instances import load_instances
+from rhp_drake.physics import UNCERTAINTY_LEVELS, ObjectPhysics, draw_physics
 from rhp_drake.planning.policy_config import MakePolicy, PolicyConfig
 from rhp_drake.push_model.transition import PushModel
+from rhp_drake.random_streams import stream
 from rhp_drake.task import TaskInstance
 from rhp_drake.workers import run_over
 
@@ -22,8 +24,13 @@ PLANAR: Final = "planar"
 STATION: Final = "station"
 WORLDS: Final = (PLANAR, STATION)
 
-# Table I of the paper, without uncertainty: success in % after imitation alone.
-_PAPER_SUCCESS: Final = {"kdp": 98, "gp": 48, "rhp33": 78, "rhp66": 88}
+# Table I of the paper: success in % after imitation alone, by policy and uncertainty.
+_PAPER_SUCCESS: Final = {
+    "kdp": {"none": 98.0, "low": 24.5, "medium": 28.5, "high": 15.7},
+    "gp": {"none": 48.0, "low": 48.2, "medium": 42.2, "high": 44.7},
+    "rhp33": {"none": 78.0, "low": 77.2, "medium": 73.4, "high": 71.5},
+    "rhp66": {"none": 88.0, "low": 86.2, "medium": 85.8, "high": 82.8},
+}
 
 
 @dataclass(frozen=True)
@@ -32,10 +39,12 @@ class Trial:
 
     Attributes:
         policy: Its name in the table.
+        level: How much the world's physics differ from what the policy believes.
         index: Of the instance in its set.
     """
 
     policy: str
+    level: str
     index: int
 
 
@@ -45,13 +54,15 @@ class Comparison:
 
     Attributes:
         policies: By their names in the table.
+        levels: Of the physics' uncertainty, any of `UNCERTAINTY_LEVELS`.
         instances: Name of a set of instances.
         num_instances: The first so many of the set.
         world: "planar", the push model, or "station", the whole robot.
-        seed: Of the policies' random draws.
+        seed: Of the policies' random draws, and of the physics.
     """
 
     policies: dict[str, PolicyConfig]
+    levels: Sequence[str]
     instances: str
     num_instances: int
     world: str
@@ -60,6 +71,10 @@ class Comparison:
     def __post_init__(self) -> None:
         if self.world not in WORLDS:
             raise InputError(f"{self.world!r} is not a world: {', '.join(WORLDS)}.")
+        for level in self.levels:
+            if level not in UNCERTAINTY_LEVELS:
+                known = ", ".join(UNCERTAINTY_LEVELS)
+                raise InputError(f"{level!r} is not a level of uncertainty: {known}.")
         available = len(load_instances(self.instances))
         if not 1 <= self.num_instances <= available:
             raise InputError(
@@ -68,27 +83,36 @@ class Comparison:
             )
 
     def trials(self) -> list[Trial]:
-        """All of them, the policies in turn."""
+        """All of them, the policies in turn, and of each the levels."""
         return [
-            Trial(policy, index)
+            Trial(policy, level, index)
             for policy in self.policies
+            for level in self.levels
             for index in range(self.num_instances)
         ]
 
 
-# Runs an instance, under a seed and with its index in the set.
-_Runner: TypeAlias = Callable[[TaskInstance, int, int], Episode]
+# Runs an instance, under a seed and with its index in the set, in some physics.
+_Runner: TypeAlias = Callable[[TaskInstance, int, int, ObjectPhysics], Episode]
 # What a process keeps from trial to trial, by world and policy: both are dear to make.
 _runners: dict[str, _Runner] = {}
 
 
 def _make_runner(config: PolicyConfig, world: str, num_objects: int) -> _Runner:
     policy = MakePolicy(config, num_objects)
-    if world == PLANAR:
-        return partial(run_episode, PushModel(num_objects), policy)
-    from rhp_drake.evaluation.station_world import StationWorld
+    if world == STATION:
+        from rhp_drake.evaluation.station_world import StationWorld
 
-    return StationWorld(policy).run_episode
+        return StationWorld(policy).run_episode
+    push_model = PushModel(num_objects)
+
+    def run(
+        instance: TaskInstance, seed: int, index: int, physics: ObjectPhysics
+    ) -> Episode:
+        executed = PushWorld(push_model, physics)
+        return run_episode(executed, policy, instance, seed, index)
+
+    return run
 
 
 def _run_trial(trial: Trial, comparison: Comparison) -> Episode:
@@ -97,7 +121,13 @@ def _run_trial(trial: Trial, comparison: Comparison) -> Episode:
     key = f"{world} {config!r}"
     if key not in _runners:
         _runners[key] = _make_runner(config, world, instance.num_objects)
-    return _runners[key](instance, comparison.seed, trial.index)
+    physics = draw_physics(
+        trial.level,
+        instance.initial_state,
+        # The same draws at each level, more or less spread.
+        stream(comparison.seed, trial.index, "world_physics"),
+    )
+    return _runners[key](instance, comparison.seed, trial.index, physics)
 
 
 def run_comparison(
@@ -110,7 +140,7 @@ def run_comparison(
 
 
 def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
-    """A table of success, causes of failure, and cost, a row a policy.
+    """A table of success, causes of failure, and cost, a row a policy and level.
 
     Beside the success stands what the paper's imitation columns say of the policy.
     Actions and computation are means over the runs that succeeded; the last number is
@@ -119,6 +149,7 @@ def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
     # Without frames, it fits into 80 columns.
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("\npolicy", no_wrap=True)
+    table.add_column("uncer-\ntainty", no_wrap=True)
     table.add_column("success %\n(95 % Wilson)", justify="right", no_wrap=True)
     table.add_column("paper\n%", justify="right", no_wrap=True)
     table.add_column("\nactions", justify="right", no_wrap=True)
@@ -126,8 +157,10 @@ def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
     table.add_column("thinks\ns a run", justify="right", no_wrap=True)
     table.add_column("x real\ntime", justify="right", no_wrap=True)
     table.add_column("\nfailures")
-    for policy in dict.fromkeys(trial.policy for trial, _ in results):
-        episodes = [episode for trial, episode in results if trial.policy == policy]
+    rows: dict[tuple[str, str], list[Episode]] = {}
+    for trial, episode in results:
+        rows.setdefault((trial.policy, trial.level), []).append(episode)
+    for (policy, level), episodes in rows.items():
         successes = [episode for episode in episodes if episode.succeeded]
         seconds = [s for episode in episodes for s in episode.decision_seconds]
         # A policy that fails at once has made no decision.
@@ -137,8 +170,9 @@ def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
         causes = [episode.outcome for episode in episodes if not episode.succeeded]
         table.add_row(
             policy,
+            level,
             format_rate(len(successes), len(episodes)),
-            str(_PAPER_SUCCESS.get(policy, "")),
+            str(_PAPER_SUCCESS.get(policy, {}).get(level, "")),
             f"{_mean([e.num_actions for e in successes]):.1f}",
             f"{p50:.1f} / {p95:.1f}",
             f"{_mean([sum(e.decision_seconds) for e in successes]):.2f}",

@@ -6,8 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
+from rhp_drake.physics import ObjectPhysics
 from rhp_drake.planning.policy import Policy, PolicyError
-from rhp_drake.push_model.transition import PushModelError
+from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import MAX_ACTIONS, TaskInstance, goals_reached, objects_fallen
 
@@ -18,6 +19,23 @@ class PlanarWorld(Protocol):
     def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The states (N, 3 + 3 m) after the actions (N,)."""
         ...
+
+
+@dataclass(frozen=True)
+class PushWorld:
+    """The push model as a world whose physics the planner may not know.
+
+    Attributes:
+        push_model: Simulates it.
+        physics: Of the objects.
+    """
+
+    push_model: PushModel
+    physics: ObjectPhysics
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """See `PlanarWorld`."""
+        return self.push_model.step(states, actions, self.physics)
 
 
 @dataclass(frozen=True)

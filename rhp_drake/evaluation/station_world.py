@@ -6,7 +6,7 @@ from pydrake.systems.analysis import Simulator
 
 from rhp_drake.closed_loop import MakeClosedLoop, run_closed_loop
 from rhp_drake.evaluation.episode import Episode
-from rhp_drake.physics import nominal_physics
+from rhp_drake.physics import ObjectPhysics
 from rhp_drake.planning.policy import Policy
 from rhp_drake.scenario import Scenario
 from rhp_drake.systems.receding_horizon_planner import DecisionRecord
@@ -25,7 +25,9 @@ class StationWorld:
         self._time_limit = scenario.time_limit
         self._simulator = Simulator(MakeClosedLoop(scenario, policy))
 
-    def run_episode(self, instance: TaskInstance, seed: int, index: int) -> Episode:
+    def run_episode(
+        self, instance: TaskInstance, seed: int, index: int, physics: ObjectPhysics
+    ) -> Episode:
         """Runs the policy on an instance; see `episode.run_episode`."""
         seconds: list[float] = []
 
@@ -36,7 +38,7 @@ class StationWorld:
         outcome = run_closed_loop(
             self._simulator,
             instance,
-            nominal_physics(instance.num_objects),
+            physics,
             # A task's own seed: the planner's streams know no index of an instance.
             seed=seed * 1_000_000 + index,
             time_limit=self._time_limit,
