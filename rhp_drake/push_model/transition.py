@@ -2,7 +2,7 @@
 
 The hand's motion is prescribed: it cannot be stopped, and ends exactly at its
 target.  Until it first touches an object nothing else moves, so an action is
-simulated from just before the first touch on, and not at all if nothing is touched.
+simulated from the first touch on, and not at all if nothing is touched.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,11 @@ from pydrake.systems.analysis import Simulator
 
 from rhp_drake.physics import SIDE_RANGE, ObjectPhysics, nominal_physics
 from rhp_drake.planar_geometry import rectangles_overlap
-from rhp_drake.push_model.diagram import TIME_STEP, MakePushContext, MakePushDiagram
+from rhp_drake.push_model.diagram import (
+    TIME_STEP,
+    MakePushDiagram,
+    MakePushSimulator,
+)
 from rhp_drake.task import (
     BOX_SIDE,
     HAND_RECTANGLES,
@@ -24,11 +28,14 @@ from rhp_drake.task import (
     hand_targets,
 )
 
-# An action's path is cut into this many equal pieces; each is one time step.
+# An action's path is cut into this many equal pieces; each takes one time step.
 STEPS_PER_ACTION: Final = 10
-# Time steps in which the hand stands at its target: contact is found at the beginning
-# of a step, so the last one of the motion may leave an overlap.
-_SETTLING_STEPS: Final = 1
+_DURATION: Final = STEPS_PER_ACTION * TIME_STEP  # s
+# The piece in which something is touched is cut again.
+_PARTS_PER_PIECE: Final = 4
+# Time steps in which the hand stands at its target, taken as one: contact is found at
+# the beginning of a step, so the last one of the motion may leave an overlap.
+_SETTLING_STEPS: Final = 4
 # Each with its own physics.
 _SIMULATORS_PER_THREAD: Final = 32
 # m: bodies this far inside each other were put there by mistake.  Pushed ones stay
@@ -37,9 +44,7 @@ _SIMULATORS_PER_THREAD: Final = 32
 _DEEP_OVERLAP: Final = BOX_SIDE - SIDE_RANGE[0] + 0.005
 # The hand's rectangles as `planar_geometry` wants them, in H.
 _HAND_IN_H: Final = np.insert(HAND_RECTANGLES, 2, 0.0, axis=1)
-# Where the pieces of a path have their middles, and how far each of the hand's
-# rectangles reaches from H, m.
-_MIDWAY: Final = (np.arange(STEPS_PER_ACTION) + 0.5) / STEPS_PER_ACTION
+# How far each of the hand's rectangles reaches from H, m.
 _REACH: Final = np.linalg.norm(
     np.abs(HAND_RECTANGLES[:, :2]) + HAND_RECTANGLES[:, 2:], axis=1
 )
@@ -51,37 +56,40 @@ class PushModelError(ValueError):
     """A transition cannot be computed; the message names its state."""
 
 
-def _swept_rectangles(motions: np.ndarray) -> np.ndarray:
-    """Rectangles that cover what the hand sweeps in each piece of its path.
+def _swept_rectangles(
+    motions: np.ndarray, middles: np.ndarray, length: float
+) -> np.ndarray:
+    """Rectangles that cover what the hand sweeps in pieces of its path.
 
     Args:
         motions: Displacements of the hand in the frame H of its start, shape (N, 3).
+        middles: Where the pieces have their middles, in [0, 1], shape (N or 1, K).
+        length: Of a piece; the path's is 1.
 
     Returns:
-        Rectangles of `planar_geometry` in that frame, shape
-        (N, STEPS_PER_ACTION, 3, 5).
+        Rectangles of `planar_geometry` in that frame, shape (N, K, 3, 5).
     """
-    x, y, theta = np.moveaxis(_MIDWAY[:, None, None] * motions, -1, 0)[..., None]
+    x, y, theta = np.moveaxis(middles[..., None] * motions[:, None], -1, 0)[..., None]
     c, s = np.cos(theta), np.sin(theta)
-    hand = HAND_RECTANGLES.T[:, None, None, :]
-    swept = np.empty((STEPS_PER_ACTION, len(motions), len(HAND_RECTANGLES), 5))
+    hand = HAND_RECTANGLES.T
+    swept = np.empty((*theta.shape[:2], len(HAND_RECTANGLES), 5))
     swept[..., 0] = x + c * hand[0] - s * hand[1]
     swept[..., 1] = y + s * hand[0] + c * hand[1]
     swept[..., 2] = theta
     # Half a piece before and after the middle of the piece; in a rotation no point
     # strays from there by more than its arc.
-    growth = np.abs(motions) / (2 * STEPS_PER_ACTION)
-    turn = growth[:, 2:] * _REACH
+    growth = np.abs(motions)[:, None] * (length / 2)
+    turn = growth[..., 2:] * _REACH
     # A translation oblique to the hand's axes is covered with some room to spare.
-    swept[..., 3] = hand[2] + growth[:, :1] + turn
-    swept[..., 4] = hand[3] + growth[:, 1:2] + turn
-    return np.moveaxis(swept, 0, 1)
+    swept[..., 3] = hand[2] + growth[..., :1] + turn
+    swept[..., 4] = hand[3] + growth[..., 1:2] + turn
+    return swept
 
 
 def first_touches(
     states: np.ndarray, actions: np.ndarray, side_lengths: np.ndarray
 ) -> np.ndarray:
-    """The piece of each action's path in which the hand first touches an object.
+    """How far the hand goes for sure before it touches an object.
 
     Args:
         states: Shape (N, 3 + 3 m).
@@ -89,7 +97,8 @@ def first_touches(
         side_lengths: Of the boxes, shape (N, m, 2), m.
 
     Returns:
-        Integers of shape (N,), `STEPS_PER_ACTION` where nothing is touched.
+        Pieces of the path, whole ones and parts of `1 / _PARTS_PER_PIECE`, of shape
+        (N,); `STEPS_PER_ACTION` where nothing is touched.
     """
     hand, objects = states[:, :3], states[:, 3:].reshape(len(states), -1, 3)
     # All in the frame H of the action's start.
@@ -113,11 +122,43 @@ def first_touches(
             motions[:, 2],
         ]
     )
-    overlaps = rectangles_overlap(
-        _swept_rectangles(motions)[:, :, :, None], boxes[:, None, None]
+    everywhere = np.zeros((1, 1))
+    pieces = _first_touched(motions, boxes, everywhere, 1.0, STEPS_PER_ACTION)
+    touched = pieces < STEPS_PER_ACTION
+    begins = pieces[touched, None] / STEPS_PER_ACTION
+    length = 1 / STEPS_PER_ACTION
+    parts = _first_touched(
+        motions[touched], boxes[touched], begins, length, _PARTS_PER_PIECE
     )
+    touches = pieces.astype(float)
+    touches[touched] += parts / _PARTS_PER_PIECE
+    return touches
+
+
+def _first_touched(
+    motions: np.ndarray,
+    boxes: np.ndarray,
+    begins: np.ndarray,
+    length: float,
+    count: int,
+) -> np.ndarray:
+    """Which of the `count` equal pieces of a stretch of the path touches a box first.
+
+    Args:
+        motions: Displacements of the hand in the frame H of its start, shape (N, 3).
+        boxes: Rectangles of `planar_geometry` in that frame, shape (N, m, 5).
+        begins: Where the stretches begin, in [0, 1], shape (N or 1, 1).
+        length: Of the stretches; the path's is 1.
+        count: Pieces of a stretch.
+
+    Returns:
+        Integers of shape (N,), `count` where none does.
+    """
+    middles = begins + (np.arange(count) + 0.5) * (length / count)
+    swept = _swept_rectangles(motions, middles, length / count)
+    overlaps = rectangles_overlap(swept[:, :, :, None], boxes[:, None, None])
     touched = np.any(overlaps, axis=(2, 3))
-    return np.where(touched.any(axis=1), touched.argmax(axis=1), STEPS_PER_ACTION)
+    return np.where(touched.any(axis=1), touched.argmax(axis=1), count)
 
 
 class PushModel:
@@ -134,17 +175,14 @@ class PushModel:
         num_threads: Threads to spread a batch over; Drake simulates without Python's
             lock.
         refinement: Time steps for each piece of a path; 1 is the push model, more
-            is a finer reference.
+            is a finer reference, less a coarser one.
     """
 
     def __init__(
-        self, num_objects: int, num_threads: int = 1, refinement: int = 1
+        self, num_objects: int, num_threads: int = 1, refinement: float = 1
     ) -> None:
         self.num_objects = num_objects
-        self._refinement = refinement
         self._time_step = TIME_STEP / refinement
-        self.diagram = MakePushDiagram(num_objects, self._time_step)
-        self._plant = self.diagram.plant()
         self._simulators: list[dict[bytes, Simulator]] = [
             {} for _ in range(num_threads)
         ]
@@ -201,9 +239,14 @@ class PushModel:
             # Interleaved, so that each thread gets its share of the long ones.
             for column in columns[thread::num_threads]:
                 simulator = self._simulator(thread, each[column])
-                self._simulate(
-                    simulator, states[column], results[column], int(touches[column])
-                )
+                try:
+                    self._simulate(
+                        simulator, states[column], results[column], touches[column]
+                    )
+                except PushModelError:
+                    # The integrator remembers the step in which it failed.
+                    self._simulators[thread].clear()
+                    raise
 
         jobs = []
         if self._threads is not None:
@@ -225,43 +268,49 @@ class PushModel:
         if simulator is None:
             if len(simulators) >= _SIMULATORS_PER_THREAD:
                 del simulators[next(iter(simulators))]
-            simulator = Simulator(self.diagram, MakePushContext(self.diagram, physics))
+            diagram = _push_diagram(physics.num_objects)
+            simulator = MakePushSimulator(diagram, physics, self._time_step)
         simulators[key] = simulator
         return simulator
 
     def _simulate(
-        self, simulator: Simulator, state: np.ndarray, result: np.ndarray, touch: int
+        self, simulator: Simulator, state: np.ndarray, result: np.ndarray, touch: float
     ) -> None:
         """Writes the objects' poses of `result`, where the hand has arrived."""
+        plant = simulator.get_system().plant()
         context = simulator.get_mutable_context()
-        plant_context = self._plant.GetMyMutableContextFromRoot(context)
-        # Parked objects stand where they stand.
-        positions = self._plant.GetPositions(plant_context)
-        velocities = np.zeros(len(positions))
-        positions[: len(state)] = state
+        plant_context = plant.GetMyMutableContextFromRoot(context)
+        integrator = simulator.get_mutable_integrator()
+        begin = touch * TIME_STEP
+        if begin > 0:
+            # Contact is found at the beginning of a step: the hand begins just inside
+            # of what it does not touch from the beginning.
+            begin += min(TIME_STEP, self._time_step) / _PARTS_PER_PIECE
         motion = result[:3] - state[:3]
-        positions[:3] += motion * (touch / STEPS_PER_ACTION)
-        velocities[:3] = motion / (STEPS_PER_ACTION * TIME_STEP)
-        steps = (STEPS_PER_ACTION - touch) * self._refinement
+        moving = np.zeros(2 * len(state))
+        moving[: len(state)] = state
+        moving[:3] += motion * (begin / _DURATION)
+        moving[len(state) :][:3] = motion / _DURATION
         try:
-            context.SetTime(0.0)
-            self._plant.SetPositions(plant_context, positions)
-            self._plant.SetVelocities(plant_context, velocities)
-            simulator.Initialize()
-            # Half a step less than so many periods: exactly so many updates, whatever
-            # the rounding.
-            simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
+            # Time goes on from push to push: setting it back takes an initialization.
+            time = context.get_time()
+            plant.SetPositionsAndVelocities(plant_context, moving)
+            if begin < _DURATION:
+                time += _DURATION - begin
+                integrator.set_maximum_step_size(self._time_step)
+                simulator.AdvanceTo(time, False)
             # The hand stands; what it still overlaps comes out.
-            self._plant.SetVelocities(plant_context, 0 * velocities)
-            steps += _SETTLING_STEPS * self._refinement
-            simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
+            plant.SetVelocities(plant_context, np.zeros(len(state)))
+            settling_time = _SETTLING_STEPS * self._time_step
+            integrator.set_maximum_step_size(settling_time)
+            simulator.AdvanceTo(time + settling_time, False)
         except (RuntimeError, SystemExit) as error:
             # Drake's assertions arrive as SystemExit.
             raise PushModelError(
                 f"the push model failed from state {state.tolist()} with the hand "
                 f"going to {result[:3].tolist()}: {error}"
             ) from error
-        result[3:] = self._plant.GetPositions(plant_context)[3 : len(state)]
+        result[3:] = plant.GetPositions(plant_context)[3:]
 
     def _check(
         self,
@@ -293,6 +342,10 @@ class PushModel:
                 f"state {bad[0]} of the batch, {states[bad[0]].tolist()}, has bodies "
                 "deep inside each other."
             )
+
+
+# Threads may share them: a diagram does not change.
+_push_diagram = cache(MakePushDiagram)
 
 
 @cache
