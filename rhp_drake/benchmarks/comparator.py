@@ -17,7 +17,7 @@ import numpy as np
 
 from rhp_drake.physics import nominal_physics
 from rhp_drake.push_model.diagram import limit_surface_length
-from rhp_drake.push_model.transition import STEPS_PER_ACTION, first_touches
+from rhp_drake.push_model.touch import STEPS_PER_ACTION, first_touches
 from rhp_drake.task import BOX_SIDE, hand_targets
 
 # m: the radius of gyration that does what is said above.
