@@ -12,6 +12,7 @@ from rhp_drake.benchmarks.pairs import (
     sample_contact_pairs,
 )
 from rhp_drake.benchmarks.push_model import measure_accuracy, measure_threads
+from rhp_drake.benchmarks.push_profile import measure_profile
 from rhp_drake.frozen_instances import load_instances
 from rhp_drake.random_streams import VALIDATION
 from rhp_drake.task import Action, hand_targets
@@ -83,9 +84,21 @@ def test_results_hardly_depend_on_earlier_ones(name, pairs):
 def test_accuracy_of_all_engines(pairs):
     engines = available_engines()
     accuracies = measure_accuracy(engines, (pairs[0][:8], pairs[1][:8]), 3)
-    assert [a.engine for a in accuracies] == [e for e in engines for _ in range(3)]
-    assert accuracies[0].slowness.median == 1
-    assert accuracies[2].own.mean < accuracies[0].own.mean
+    assert [(a.engine, a.refinement) for a in accuracies] == [
+        (e, k) for e in engines for k in (0.5, 1, 2, 4)
+    ]
+    coarse, usual, _, fine = accuracies[:4]
+    assert usual.slowness.median == 1
+    assert fine.own.mean < usual.own.mean < coarse.own.mean
+
+
+def test_profile_adds_up(pairs):
+    profile = measure_profile((pairs[0][:20], pairs[1][:20]), 3)
+    *parts, whole = [part.seconds.median for part in profile.parts]
+    assert min(parts) > 0
+    assert sum(parts) == pytest.approx(whole, rel=0.2)
+    # A push has at most one for each piece of its path, and one to settle.
+    assert 1 < profile.steps <= 11
 
 
 def test_speed_by_threads(pairs):

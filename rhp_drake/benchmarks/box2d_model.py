@@ -1,5 +1,6 @@
 """The push model's scene in Box2D, for comparison."""
 
+import math
 from typing import Final
 
 import Box2D
@@ -34,9 +35,11 @@ class Box2DModel(Comparator):
         refinement: How many times more steps than usual; a reference needs more.
     """
 
-    def __init__(self, num_objects: int, refinement: int = 1) -> None:
+    def __init__(self, num_objects: int, refinement: float = 1) -> None:
         super().__init__(
-            num_objects, _STEPS_PER_PIECE * refinement, _SETTLING_STEPS * refinement
+            num_objects,
+            _STEPS_PER_PIECE * refinement,
+            math.ceil(_SETTLING_STEPS * refinement),
         )
         self._world = Box2D.b2World(gravity=(0, 0), continuousPhysics=False)
         # Shapes have a skin, outside of which contact is kept but for the slop.

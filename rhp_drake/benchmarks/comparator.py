@@ -10,13 +10,14 @@ by integrating it explicitly.
 """
 
 from abc import ABC, abstractmethod
+import math
 from typing import Final
 
 import numpy as np
 
 from rhp_drake.physics import nominal_physics
 from rhp_drake.push_model.diagram import limit_surface_length
-from rhp_drake.push_model.transition import STEPS_PER_ACTION, first_touches
+from rhp_drake.push_model.touch import STEPS_PER_ACTION, first_touches
 from rhp_drake.task import BOX_SIDE, hand_targets
 
 # m: the radius of gyration that does what is said above.
@@ -34,7 +35,7 @@ class Comparator(ABC):
     """
 
     def __init__(
-        self, num_objects: int, steps_per_piece: int, settling_steps: int
+        self, num_objects: int, steps_per_piece: float, settling_steps: int
     ) -> None:
         self.num_objects = num_objects
         self._side_lengths = nominal_physics(num_objects).side_lengths
@@ -60,10 +61,9 @@ class Comparator(ABC):
         for column in np.flatnonzero(touches < STEPS_PER_ACTION):
             touch = int(touches[column])
             state = states[column].copy()
-            motion = results[column, :3] - state[:3]
-            state[:3] += motion * (touch / STEPS_PER_ACTION)
-            num_steps = (STEPS_PER_ACTION - touch) * self._steps_per_piece
-            step_motion = motion / (STEPS_PER_ACTION * self._steps_per_piece)
+            state[:3] += (results[column, :3] - state[:3]) * (touch / STEPS_PER_ACTION)
+            num_steps = math.ceil((STEPS_PER_ACTION - touch) * self._steps_per_piece)
+            step_motion = (results[column, :3] - state[:3]) / num_steps
             results[column, 3:] = self._push(state, step_motion, num_steps)
         return results
 

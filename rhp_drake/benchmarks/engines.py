@@ -10,26 +10,26 @@ from rhp_drake.evaluation.episode import PlanarWorld
 PUSH_MODEL: Final = "push model"
 
 
-def _make_push_model(num_objects: int, refinement: int) -> PlanarWorld:
+def _make_push_model(num_objects: int, refinement: float) -> PlanarWorld:
     from rhp_drake.push_model.transition import PushModel
 
     return PushModel(num_objects, refinement=refinement)
 
 
-def _make_box2d(num_objects: int, refinement: int) -> PlanarWorld:
+def _make_box2d(num_objects: int, refinement: float) -> PlanarWorld:
     from rhp_drake.benchmarks.box2d_model import Box2DModel
 
     return Box2DModel(num_objects, refinement)
 
 
-def _make_mujoco(num_objects: int, refinement: int) -> PlanarWorld:
+def _make_mujoco(num_objects: int, refinement: float) -> PlanarWorld:
     from rhp_drake.benchmarks.mujoco_model import MuJoCoModel
 
     return MuJoCoModel(num_objects, refinement)
 
 
 # By their names in the tables: the package, and the engine for m and a refinement.
-_ENGINES: Final[dict[str, tuple[str, Callable[[int, int], PlanarWorld]]]] = {
+_ENGINES: Final[dict[str, tuple[str, Callable[[int, float], PlanarWorld]]]] = {
     PUSH_MODEL: ("pydrake", _make_push_model),
     "Box2D": ("Box2D", _make_box2d),
     "MuJoCo": ("mujoco", _make_mujoco),
@@ -47,7 +47,7 @@ def describe_engines() -> str:
     return ", ".join(f"{p} {version(p) if find_spec(p) else 'none'}" for p in packages)
 
 
-def make_engine(name: str, num_objects: int, refinement: int = 1) -> PlanarWorld:
+def make_engine(name: str, num_objects: int, refinement: float = 1) -> PlanarWorld:
     """Makes an engine for m = `num_objects`.
 
     Args:

@@ -1,5 +1,6 @@
 """The push model's scene in MuJoCo, for comparison."""
 
+import math
 from typing import Final
 
 import mujoco
@@ -33,9 +34,11 @@ class MuJoCoModel(Comparator):
         refinement: How many times more steps than usual; a reference needs more.
     """
 
-    def __init__(self, num_objects: int, refinement: int = 1) -> None:
+    def __init__(self, num_objects: int, refinement: float = 1) -> None:
         super().__init__(
-            num_objects, _STEPS_PER_PIECE * refinement, _SETTLING_STEPS * refinement
+            num_objects,
+            _STEPS_PER_PIECE * refinement,
+            math.ceil(_SETTLING_STEPS * refinement),
         )
         self._model = mujoco.MjModel.from_xml_string(_scene(num_objects))
         self._data = mujoco.MjData(self._model)

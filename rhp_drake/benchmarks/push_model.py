@@ -22,7 +22,7 @@ from rhp_drake.evaluation.statistics import bootstrap_interval
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 
-REFINEMENTS: Final = (1, 2, 4)
+REFINEMENTS: Final = (0.5, 1, 2, 4)
 # Of the reference that an engine's error is measured against.
 FINE: Final = 20
 NUMBERS_OF_OBJECTS: Final = (1, 3, 5, 10)
@@ -67,7 +67,7 @@ class Accuracy:
 
     Attributes:
         engine: Its name.
-        refinement: How many times more steps than usual.
+        refinement: How many times more steps than usual; 0.5 are half as many.
         seconds: Of an action, in one thread.
         slowness: `seconds` over those of the push model as it is, turn by turn.
         own: Against the same engine at `FINE`.
@@ -75,7 +75,7 @@ class Accuracy:
     """
 
     engine: str
-    refinement: int
+    refinement: float
     seconds: Spread
     slowness: Spread
     own: Errors
@@ -125,8 +125,8 @@ def measure_accuracy(
         Accuracy(
             engine,
             refinement,
-            _spread(seconds[i]),
-            _spread(seconds[i] / base),
+            spread_of(seconds[i]),
+            spread_of(seconds[i] / base),
             _summarize(states, results[i], fine[engine]),
             _summarize(states, results[i], fine[PUSH_MODEL]),
         )
@@ -150,7 +150,7 @@ def measure_threads(
     speeds = []
     for (kind, n), of_case in zip(cases, seconds, strict=True):
         count = len(pairs_by_kind[kind][1])
-        speeds.append(Speed(kind, num_objects, count, n, _spread(count / of_case)))
+        speeds.append(Speed(kind, num_objects, count, n, spread_of(count / of_case)))
     return speeds
 
 
@@ -162,7 +162,7 @@ def measure_objects(seed: int) -> list[Speed]:
     seconds = _in_turns([_stepping(PushModel(m), pairs) for m, pairs in cases])
     count = _PAIRS_OF_GROWTH
     return [
-        Speed("contact", m, count, 1, _spread(count / of_case))
+        Speed("contact", m, count, 1, spread_of(count / of_case))
         for (m, _), of_case in zip(cases, seconds, strict=True)
     ]
 
@@ -194,7 +194,7 @@ def measure_batches(pairs: Pairs, num_objects: int) -> list[Speed]:
         [step_batches(*case) for case in zip(BATCH_SIZES, counts, strict=True)]
     )
     return [
-        Speed("contact", num_objects, size, 1, _spread(size * count / of_case))
+        Speed("contact", num_objects, size, 1, spread_of(size * count / of_case))
         for size, count, of_case in zip(BATCH_SIZES, counts, seconds, strict=True)
     ]
 
@@ -219,7 +219,8 @@ def _in_turns(functions: Sequence[Callable[[], None]]) -> np.ndarray:
     return seconds
 
 
-def _spread(values: np.ndarray) -> Spread:
+def spread_of(values: np.ndarray) -> Spread:
+    """Median and range of the values."""
     return Spread(float(np.median(values)), float(values.min()), float(values.max()))
 
 

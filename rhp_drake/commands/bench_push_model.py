@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rhp_drake.benchmarks.decision import DecisionTimes
     from rhp_drake.benchmarks.other_worlds import World, WorldTrial
     from rhp_drake.benchmarks.push_model import Accuracy, Errors, Speed, Spread
+    from rhp_drake.benchmarks.push_profile import Profile
     from rhp_drake.evaluation.episode import Episode
 
 
@@ -88,6 +89,7 @@ def _measure_transitions(console: "Console", count: int, seed: int) -> dict:
         measure_objects,
         measure_threads,
     )
+    from rhp_drake.benchmarks.push_profile import measure_profile
     from rhp_drake.frozen_instances import NUM_OBJECTS as M
 
     with console.status("Drawing pairs"):
@@ -96,6 +98,9 @@ def _measure_transitions(console: "Console", count: int, seed: int) -> dict:
     with console.status("Accuracy"):
         accuracies = measure_accuracy(available_engines(), contact, M)
     console.print(_accuracy_table(accuracies, f"{count} pairs, seed {seed}"))
+    with console.status("Profile"):
+        profile = measure_profile(contact, M)
+    console.print(_profile_table(profile, f"{count} pairs, one thread"))
     with console.status("Speed"):
         kinds = {"contact": contact, "mixed": mixed}
         speeds = [
@@ -106,6 +111,7 @@ def _measure_transitions(console: "Console", count: int, seed: int) -> dict:
     console.print(_speed_table(speeds))
     return {
         "accuracy": [asdict(a) for a in accuracies],
+        "profile": asdict(profile),
         "speed": [asdict(s) for s in speeds],
     }
 
@@ -183,12 +189,32 @@ def _accuracy_table(accuracies: "Sequence[Accuracy]", title: str) -> "Table":
     for i, a in enumerate(accuracies):
         is_last = i + 1 == len(accuracies) or accuracies[i + 1].engine != a.engine
         table.add_row(
-            f"{a.engine} {a.refinement} x",
+            f"{a.engine} {a.refinement:g} x",
             _format_errors(a.own),
             f"{1e3 * a.push_model.mean:.2f}",
             f"{1e3 * a.seconds.median:.3f}",
             _format_spread(a.slowness, 1.0, 2),
             end_section=is_last,
+        )
+    return table
+
+
+def _profile_table(profile: "Profile", title: str) -> "Table":
+    from rich.table import Table
+
+    table = Table(
+        title=f"Where a contact-rich push's time goes: {title}",
+        caption=f"median (range) of repeated runs; {profile.steps:.1f} steps a push",
+    )
+    table.add_column("part", no_wrap=True)
+    for heading in ("us a push", "%"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for i, part in enumerate(profile.parts):
+        table.add_row(
+            part.name,
+            _format_spread(part.seconds, 1e6, 1),
+            _format_spread(part.share, 100.0, 0),
+            end_section=i + 2 == len(profile.parts),
         )
     return table
 

@@ -2,7 +2,7 @@
 
 The hand's motion is prescribed: it cannot be stopped, and ends exactly at its
 target.  Until it first touches an object nothing else moves, so an action is
-simulated from just before the first touch on, and not at all if nothing is touched.
+simulated from the first touch on, and not at all if nothing is touched.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,137 +14,54 @@ from typing import Final
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from rhp_drake.physics import SIDE_RANGE, ObjectPhysics, nominal_physics
-from rhp_drake.planar_geometry import rectangles_overlap
-from rhp_drake.push_model.diagram import TIME_STEP, MakePushContext, MakePushDiagram
-from rhp_drake.task import (
-    BOX_SIDE,
-    HAND_RECTANGLES,
-    Action,
-    hand_targets,
+from rhp_drake.physics import ObjectPhysics, nominal_physics
+from rhp_drake.push_model.diagram import (
+    TIME_STEP,
+    MakePushDiagram,
+    MakePushSimulator,
 )
+from rhp_drake.push_model.touch import (
+    PARTS_PER_PIECE,
+    STEPS_PER_ACTION,
+    first_touches,
+    overlaps_deeply,
+)
+from rhp_drake.task import Action, hand_targets
 
-# An action's path is cut into this many equal pieces; each is one time step.
-STEPS_PER_ACTION: Final = 10
-# Time steps in which the hand stands at its target: contact is found at the beginning
-# of a step, so the last one of the motion may leave an overlap.
-_SETTLING_STEPS: Final = 1
+_DURATION: Final = STEPS_PER_ACTION * TIME_STEP  # s
+# Time steps in which the hand stands at its target, taken as one: contact is found at
+# the beginning of a step, so the last one of the motion may leave an overlap.
+_SETTLING_STEPS: Final = 4
 # Each with its own physics.
 _SIMULATORS_PER_THREAD: Final = 32
-# m: bodies this far inside each other were put there by mistake.  Pushed ones stay
-# below 1 cm, which it takes two boxes jammed between the fingers to reach; but a
-# planner that believes in nominal boxes may see smaller ones closer than those can be.
-_DEEP_OVERLAP: Final = BOX_SIDE - SIDE_RANGE[0] + 0.005
-# The hand's rectangles as `planar_geometry` wants them, in H.
-_HAND_IN_H: Final = np.insert(HAND_RECTANGLES, 2, 0.0, axis=1)
-# Where the pieces of a path have their middles, and how far each of the hand's
-# rectangles reaches from H, m.
-_MIDWAY: Final = (np.arange(STEPS_PER_ACTION) + 0.5) / STEPS_PER_ACTION
-_REACH: Final = np.linalg.norm(
-    np.abs(HAND_RECTANGLES[:, :2]) + HAND_RECTANGLES[:, 2:], axis=1
-)
-# m: what two bodies at rest in contact may overlap, an error of the contact solver.
-_CONTACT_TOLERANCE: Final = 2e-4
 
 
 class PushModelError(ValueError):
     """A transition cannot be computed; the message names its state."""
 
 
-def _swept_rectangles(motions: np.ndarray) -> np.ndarray:
-    """Rectangles that cover what the hand sweeps in each piece of its path.
-
-    Args:
-        motions: Displacements of the hand in the frame H of its start, shape (N, 3).
-
-    Returns:
-        Rectangles of `planar_geometry` in that frame, shape
-        (N, STEPS_PER_ACTION, 3, 5).
-    """
-    x, y, theta = np.moveaxis(_MIDWAY[:, None, None] * motions, -1, 0)[..., None]
-    c, s = np.cos(theta), np.sin(theta)
-    hand = HAND_RECTANGLES.T[:, None, None, :]
-    swept = np.empty((STEPS_PER_ACTION, len(motions), len(HAND_RECTANGLES), 5))
-    swept[..., 0] = x + c * hand[0] - s * hand[1]
-    swept[..., 1] = y + s * hand[0] + c * hand[1]
-    swept[..., 2] = theta
-    # Half a piece before and after the middle of the piece; in a rotation no point
-    # strays from there by more than its arc.
-    growth = np.abs(motions) / (2 * STEPS_PER_ACTION)
-    turn = growth[:, 2:] * _REACH
-    # A translation oblique to the hand's axes is covered with some room to spare.
-    swept[..., 3] = hand[2] + growth[:, :1] + turn
-    swept[..., 4] = hand[3] + growth[:, 1:2] + turn
-    return np.moveaxis(swept, 0, 1)
-
-
-def first_touches(
-    states: np.ndarray, actions: np.ndarray, side_lengths: np.ndarray
-) -> np.ndarray:
-    """The piece of each action's path in which the hand first touches an object.
-
-    Args:
-        states: Shape (N, 3 + 3 m).
-        actions: Integers of shape (N,).
-        side_lengths: Of the boxes, shape (N, m, 2), m.
-
-    Returns:
-        Integers of shape (N,), `STEPS_PER_ACTION` where nothing is touched.
-    """
-    hand, objects = states[:, :3], states[:, 3:].reshape(len(states), -1, 3)
-    # All in the frame H of the action's start.
-    offsets = objects[..., :2] - hand[:, None, :2]
-    c, s = np.cos(hand[:, None, 2]), np.sin(hand[:, None, 2])
-    boxes = np.concatenate(
-        [
-            (c * offsets[..., 0] + s * offsets[..., 1])[..., None],
-            (c * offsets[..., 1] - s * offsets[..., 0])[..., None],
-            (objects[..., 2] - hand[:, None, 2])[..., None],
-            side_lengths / 2 - _CONTACT_TOLERANCE,
-        ],
-        axis=-1,
-    )
-    motions = hand_targets(states, actions) - hand
-    c, s = c[:, 0], s[:, 0]
-    motions = np.column_stack(
-        [
-            c * motions[:, 0] + s * motions[:, 1],
-            c * motions[:, 1] - s * motions[:, 0],
-            motions[:, 2],
-        ]
-    )
-    overlaps = rectangles_overlap(
-        _swept_rectangles(motions)[:, :, :, None], boxes[:, None, None]
-    )
-    touched = np.any(overlaps, axis=(2, 3))
-    return np.where(touched.any(axis=1), touched.argmax(axis=1), STEPS_PER_ACTION)
-
-
 class PushModel:
     """Steps batches of (state, action) pairs.
 
-    Each thread owns a simulator, with its own context of the one diagram, for each of
-    the latest physics it met.  A transition depends on its own state, action and
-    physics alone, so results are the same bits whatever the batch and the number of
-    threads.  (Drake's batch evaluation would clone a context at every call, which costs
-    more than a transition.)
+    Each thread owns a simulator, with its own context of the diagram for its number of
+    objects, for each of the latest physics it met.  A transition depends on its own
+    state, action and physics alone, so results are the same bits whatever the batch and
+    the number of threads.  (Drake's batch evaluation would clone a context at every
+    call, which costs more than a transition.)
 
     Args:
         num_objects: The largest m that it can step.
         num_threads: Threads to spread a batch over; Drake simulates without Python's
             lock.
-        refinement: Time steps for each piece of a path; 1 is the push model, more
-            is a finer reference.
+        refinement: Time steps for each piece of a path, whose times must add up as
+            those of `TIME_STEP` do; 1 is the push model, 20 a finer reference.
     """
 
     def __init__(
-        self, num_objects: int, num_threads: int = 1, refinement: int = 1
+        self, num_objects: int, num_threads: int = 1, refinement: float = 1
     ) -> None:
         self.num_objects = num_objects
-        self._refinement = refinement
         self._time_step = TIME_STEP / refinement
-        self.diagram = MakePushDiagram(num_objects, self._time_step)
-        self._plant = self.diagram.plant()
         self._simulators: list[dict[bytes, Simulator]] = [
             {} for _ in range(num_threads)
         ]
@@ -201,9 +118,14 @@ class PushModel:
             # Interleaved, so that each thread gets its share of the long ones.
             for column in columns[thread::num_threads]:
                 simulator = self._simulator(thread, each[column])
-                self._simulate(
-                    simulator, states[column], results[column], int(touches[column])
-                )
+                try:
+                    self._simulate(
+                        simulator, states[column], results[column], touches[column]
+                    )
+                except PushModelError:
+                    # The integrator remembers the step in which it failed.
+                    self._simulators[thread].clear()
+                    raise
 
         jobs = []
         if self._threads is not None:
@@ -225,43 +147,49 @@ class PushModel:
         if simulator is None:
             if len(simulators) >= _SIMULATORS_PER_THREAD:
                 del simulators[next(iter(simulators))]
-            simulator = Simulator(self.diagram, MakePushContext(self.diagram, physics))
+            diagram = _push_diagram(physics.num_objects)
+            simulator = MakePushSimulator(diagram, physics, self._time_step)
         simulators[key] = simulator
         return simulator
 
     def _simulate(
-        self, simulator: Simulator, state: np.ndarray, result: np.ndarray, touch: int
+        self, simulator: Simulator, state: np.ndarray, result: np.ndarray, touch: float
     ) -> None:
         """Writes the objects' poses of `result`, where the hand has arrived."""
+        plant = simulator.get_system().plant()
         context = simulator.get_mutable_context()
-        plant_context = self._plant.GetMyMutableContextFromRoot(context)
-        # Parked objects stand where they stand.
-        positions = self._plant.GetPositions(plant_context)
-        velocities = np.zeros(len(positions))
-        positions[: len(state)] = state
+        plant_context = plant.GetMyMutableContextFromRoot(context)
+        integrator = simulator.get_mutable_integrator()
+        begin = touch * TIME_STEP
+        if begin > 0:
+            # Contact is found at the beginning of a step: the hand begins just inside
+            # of what it does not touch from the beginning.
+            begin += min(TIME_STEP, self._time_step) / PARTS_PER_PIECE
         motion = result[:3] - state[:3]
-        positions[:3] += motion * (touch / STEPS_PER_ACTION)
-        velocities[:3] = motion / (STEPS_PER_ACTION * TIME_STEP)
-        steps = (STEPS_PER_ACTION - touch) * self._refinement
+        moving = np.zeros(2 * len(state))
+        moving[: len(state)] = state
+        moving[:3] += motion * (begin / _DURATION)
+        moving[len(state) :][:3] = motion / _DURATION
         try:
-            context.SetTime(0.0)
-            self._plant.SetPositions(plant_context, positions)
-            self._plant.SetVelocities(plant_context, velocities)
-            simulator.Initialize()
-            # Half a step less than so many periods: exactly so many updates, whatever
-            # the rounding.
-            simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
+            # Time goes on from push to push: setting it back takes an initialization.
+            time = context.get_time()
+            plant.SetPositionsAndVelocities(plant_context, moving)
+            if begin < _DURATION:
+                time += _DURATION - begin
+                integrator.set_maximum_step_size(self._time_step)
+                simulator.AdvanceTo(time, False)
             # The hand stands; what it still overlaps comes out.
-            self._plant.SetVelocities(plant_context, 0 * velocities)
-            steps += _SETTLING_STEPS * self._refinement
-            simulator.AdvanceTo((steps - 0.5) * self._time_step, False)
+            plant.SetVelocities(plant_context, np.zeros(len(state)))
+            settling_time = _SETTLING_STEPS * self._time_step
+            integrator.set_maximum_step_size(settling_time)
+            simulator.AdvanceTo(time + settling_time, False)
         except (RuntimeError, SystemExit) as error:
             # Drake's assertions arrive as SystemExit.
             raise PushModelError(
                 f"the push model failed from state {state.tolist()} with the hand "
                 f"going to {result[:3].tolist()}: {error}"
             ) from error
-        result[3:] = self._plant.GetPositions(plant_context)[3 : len(state)]
+        result[3:] = plant.GetPositions(plant_context)[3:]
 
     def _check(
         self,
@@ -293,6 +221,10 @@ class PushModel:
                 f"state {bad[0]} of the batch, {states[bad[0]].tolist()}, has bodies "
                 "deep inside each other."
             )
+
+
+# Threads may share them: a diagram does not change.
+_push_diagram = cache(MakePushDiagram)
 
 
 @cache
@@ -330,29 +262,3 @@ def _physics_of_each(
                 f"the states have {m}."
             )
     return physics
-
-
-def overlaps_deeply(states: np.ndarray, side_lengths: np.ndarray) -> np.ndarray:
-    """Whether bodies are further inside each other than a push could leave them.
-
-    Args:
-        states: Shape (N, 3 + 3 m).
-        side_lengths: Shape (N, m, 2).
-
-    Returns:
-        Booleans of shape (N,).
-    """
-    depth = _DEEP_OVERLAP / 2
-    objects = states[:, 3:].reshape(len(states), -1, 3)
-    boxes = np.concatenate([objects, side_lengths / 2 - depth], axis=-1)
-    hand = np.broadcast_to(_HAND_IN_H, (len(states), *_HAND_IN_H.shape)).copy()
-    c, s = np.cos(states[:, None, 2]), np.sin(states[:, None, 2])
-    x, y = _HAND_IN_H[:, 0], _HAND_IN_H[:, 1]
-    hand[..., 0] = states[:, None, 0] + c * x - s * y
-    hand[..., 1] = states[:, None, 1] + s * x + c * y
-    hand[..., 2] = states[:, None, 2]
-    hand[..., 3:] -= depth
-    with_hand = rectangles_overlap(hand[:, :, None], boxes[:, None])
-    first, second = np.triu_indices(boxes.shape[1], 1)
-    with_boxes = rectangles_overlap(boxes[:, first], boxes[:, second])
-    return np.any(with_hand, axis=(1, 2)) | np.any(with_boxes, axis=1)
