@@ -35,8 +35,10 @@ def planners(
 ) -> None:
     """Compares our kinodynamic RRT with OMPL's RRT and SST on the same push model.
 
-    Searches end at a limit of time, so that results depend on the machine, and on what
-    else it does: leave a core to each worker.  OMPL: pip install 'rhp_drake[bench]'.
+    Searches end at a limit of time, so that results depend on the machine, and
+    on what else it does: leave a core to each worker.
+
+    OMPL comes with the extra "bench" of this project.
     """
     from importlib.metadata import version
     from importlib.util import find_spec
@@ -106,25 +108,24 @@ def _effort_table(by_planner: "dict[str, list[PlannerResult]]", title: str) -> "
     table = Table(title=title)
     table.add_column("planner")
     for heading in (
-        "s: mean, median, 95th pct",
+        "s: mean, median",
+        "95th pct",
         "simulated: mean, median",
         "actions: mean, median",
-        "simulated/s",
+        "sim. / s",
     ):
         table.add_column(heading, justify="right")
     for name, results in by_planner.items():
         solved = [r for r in results if r.solved]
         seconds = [r.seconds for r in solved] or [np.nan]
-        simulated = [r.num_transitions for r in solved]
-        lengths = [r.num_actions for r in solved]
-        rate = sum(r.num_transitions for r in results) / sum(r.seconds for r in results)
+        total_seconds = sum(r.seconds for r in results)
         table.add_row(
             name,
-            f"{np.mean(seconds):.2f}, {np.median(seconds):.2f}, "
+            _mean_and_median(seconds, 2),
             f"{np.percentile(seconds, 95):.2f}",
-            _mean_and_median(simulated, 0),
-            _mean_and_median(lengths, 1),
-            f"{rate:.0f}",
+            _mean_and_median([r.num_transitions for r in solved], 0),
+            _mean_and_median([r.num_actions for r in solved], 1),
+            f"{sum(r.num_transitions for r in results) / total_seconds:.0f}",
         )
     return table
 
