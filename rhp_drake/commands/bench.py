@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rhp_drake.commands.bench_action_frames import action_frames
+from rhp_drake.commands.bench_planners import planners
 from rhp_drake.commands.bench_push_model import push_model
 
 # Drake is imported in the functions, so that `rhp --help` is quick.
@@ -25,6 +26,7 @@ def _bench() -> None:
 
 bench.command()(push_model)
 bench.command()(action_frames)
+bench.command()(planners)
 
 
 @bench.command()

@@ -53,7 +53,7 @@ def plan_best_first(
     """
     begin = time.perf_counter()
     record = SearchRecord(len(state))
-    nodes = Nodes(state, max_transitions + _BATCH_SIZE + 1)
+    nodes = Nodes(state)
     queue: list[_Edge] = []
     goal = 0 if goals_reached(state, goals) else None
     _propose(queue, value_function, nodes, [0], goals)

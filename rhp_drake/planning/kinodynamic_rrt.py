@@ -127,7 +127,7 @@ class _Tree:
             )
             self._max_depth = length_to_beat - 1
         capacity = _RESTART + NUM_ACTIONS + 1
-        self.nodes = Nodes(state, capacity)
+        self.nodes = Nodes(state)
         self._costs = np.zeros(capacity)
         self._open = np.zeros(capacity, dtype=bool)
         self._open[0] = True

@@ -123,16 +123,14 @@ class Nodes:
             root, shape (N,).
     """
 
-    def __init__(self, root: np.ndarray, capacity: int) -> None:
-        self._states = np.empty((capacity, len(root)))
-        self._keys = np.empty((capacity, len(root)))
-        self._depths = np.zeros(capacity, dtype=int)
-        self._parents = np.full(capacity, -1)
-        self._actions = np.full(capacity, -1)
-        self._transitions = np.full(capacity, -1)
+    def __init__(self, root: np.ndarray) -> None:
         self._size = 1
-        self._states[0] = root
-        self._keys[0] = _key(root)
+        self._states = root[None]
+        self._keys = _key(root)[None]
+        self._depths = np.zeros(1, dtype=int)
+        self._parents = np.full(1, -1)
+        self._actions = np.full(1, -1)
+        self._transitions = np.full(1, -1)
 
     def __len__(self) -> int:
         return self._size
@@ -157,6 +155,8 @@ class Nodes:
     def add(self, state: np.ndarray, parent: int, action: int, transition: int) -> int:
         """Adds a state that an action led to; returns its number."""
         node = self._size
+        if node == len(self._states):
+            self._make_room()
         self._states[node] = state
         self._keys[node] = _key(state)
         self._depths[node] = self._depths[parent] + 1
@@ -165,6 +165,11 @@ class Nodes:
         self._transitions[node] = transition
         self._size += 1
         return node
+
+    def _make_room(self) -> None:
+        for name in ("states", "keys", "depths", "parents", "actions", "transitions"):
+            array = getattr(self, f"_{name}")
+            setattr(self, f"_{name}", np.concatenate([array, np.empty_like(array)]))
 
     def path(self, node: int) -> tuple[np.ndarray, np.ndarray]:
         """The actions (L,) and states (L + 1, 3 + 3 m) from the root to a node."""
