@@ -108,7 +108,7 @@ def test_a_plan_that_leads_nowhere_solves_nothing(monkeypatch):
 
 
 def test_bad_planners(monkeypatch):
-    with pytest.raises(InputError, match="'best' is not one of rrt, ompl_rrt, ompl_ss"):
+    with pytest.raises(InputError, match="'best' is not one of rrt, rrt_first, best_f"):
         check_planners(["rrt", "best"])
     monkeypatch.setattr(planners, "find_spec", lambda _: None)
     check_planners(["rrt"])

@@ -1,4 +1,4 @@
-"""`rhp bench planners`: the kinodynamic RRT beside OMPL's planners."""
+"""`rhp bench planners`: our planners beside OMPL's."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,8 +19,12 @@ _TIMES = (10.0, 30.0, 60.0)
 def planners(
     *,
     planners: Annotated[
-        str, typer.Option(help="Any of rrt, which is ours, ompl_rrt, ompl_sst.")
-    ] = "rrt,ompl_rrt,ompl_sst",
+        str,
+        typer.Option(
+            help="Any of rrt, rrt_first (the same up to its first plan), best_first "
+            "(guided by the Q-network), ompl_rrt, ompl_sst."
+        ),
+    ] = "rrt,rrt_first,best_first,ompl_rrt,ompl_sst",
     instances: Annotated[
         str, typer.Option(help="The set: evaluation (never tune on it) or validation.")
     ] = "validation",
@@ -33,7 +37,7 @@ def planners(
     seed: Annotated[int, typer.Option(min=0, help="Of the searches.")] = 0,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
-    """Compares our kinodynamic RRT with OMPL's RRT and SST on the same push model.
+    """Compares our planners with OMPL's RRT and SST on the same push model.
 
     Searches end at a limit of time, so that results depend on the machine, and
     on what else it does: leave a core to each worker.
