@@ -11,6 +11,6 @@ class InputError(ValueError):
 class WorkError(RuntimeError):
     """Work cannot go on, by no fault of what it was given: exit status 1.
 
-    A full disk, a killed worker, a lost cluster.  What is done is in files, and the
-    same command goes on from there.
+    A full disk, a killed worker, a lost cluster.  The message is one sentence; what is
+    in files by then stays.
     """

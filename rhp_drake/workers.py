@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from itertools import islice
 import logging
 import multiprocessing
+from multiprocessing.connection import wait
 import os
+import signal
+from threading import Thread
 from typing import Any, Final, TypeAlias, TypeVar
 
 from rhp_drake.errors import InputError, WorkError
@@ -50,6 +53,22 @@ def _use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
+def _start_worker() -> None:
+    """Makes a new process a worker, which does not outlive the one it works for."""
+    _use_one_thread()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        # Else a worker whose parent was killed waits for work for ever.
+        wait([parent.sentinel])
+        os._exit(1)
+
+    Thread(target=follow, daemon=True).start()
+    # Ctrl-C reaches the whole group: the parent decides what comes of it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def run_over(
     function: Callable[[Item], Result], items: Sequence[Item], workers: Workers
 ) -> Iterator[tuple[Item, Result]]:
@@ -79,21 +98,26 @@ def _run_in_processes(
 ) -> Iterator[tuple[Item, Result]]:
     # Drake and torch start threads, which a forked child would inherit broken.
     context = multiprocessing.get_context("spawn")
+    others = multiprocessing.active_children()
     with ProcessPoolExecutor(
-        num_workers, mp_context=context, initializer=_use_one_thread
+        num_workers, mp_context=context, initializer=_start_worker
     ) as pool:
         futures = {pool.submit(function, item): item for item in items}
         try:
             for future in as_completed(futures):
                 # Results may be large: none is kept.
-                item = futures.pop(future)
-                yield item, future.result()
+                result = future.result()
+                yield futures.pop(future), result
         except BrokenProcessPool:
             raise WorkError(
                 "a worker process died; was it killed, or out of memory?"
             ) from None
         finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+            if futures:  # An error, or Ctrl-C: nobody wants the rest.
+                pool.shutdown(wait=False, cancel_futures=True)
+                for process in multiprocessing.active_children():
+                    if process not in others:
+                        process.terminate()
 
 
 def _run_on_cluster(
@@ -109,7 +133,7 @@ def _run_on_cluster(
         ray.init(
             address=cluster.address, log_to_driver=False, logging_level=logging.ERROR
         )
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
         message = str(error).partition("\n")[0]
         raise InputError(f"no Ray cluster at {cluster.address!r}: {message}") from None
     # Ray itself does a task again whose node dies.
@@ -129,8 +153,10 @@ def _run_on_cluster(
             item = running.pop(done)
             yield item, ray.get(done)
     except ray.exceptions.RayTaskError as error:
-        # What the function raised, as the other workers raise it.
-        raise error.cause from None
+        # As the other workers raise it; what is no fault of ours has its traceback.
+        if isinstance(error.cause, InputError | WorkError):
+            raise error.cause from None
+        raise
     except ray.exceptions.RayError as error:
         message = str(error).partition("\n")[0]
         raise WorkError(f"the Ray cluster failed: {message}") from error

@@ -2,6 +2,8 @@ import json
 import subprocess
 import sys
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from rhp_drake import cli
@@ -87,3 +89,53 @@ def test_evaluate_writes_every_episode(monkeypatch, capsys, tmp_path):
     assert trials == [("gp", 0), ("gp", 1), ("rhp33", 0), ("rhp33", 1)]
     for episode in episodes:
         assert len(episode["decision_seconds"]) == episode["num_actions"]
+
+
+def test_demos_makes_checks_compacts_and_rebuilds(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    make = ("demos", "--plans", "3", "--first-task", "7", "--out", "data")
+    for _ in range(2):  # The second time, nothing is left to do.
+        assert rhp(monkeypatch, *make, "--workers", "1") == 0
+        printed = capsys.readouterr().out
+        assert "3 tasks, 100.0" in printed
+        assert "plans an hour and core" in printed
+    (shard,) = (tmp_path / "data").glob("*.parquet")
+    assert rhp(monkeypatch, "demos", "verify", "data", "--workers", "1") == 0
+    printed = capsys.readouterr().out
+    assert "3 of 3 plans reach the goal again." in printed
+    assert "3 of 3 go through the stored states" in printed
+    assert rhp(monkeypatch, "demos", "compact", "data", "--out", "c.parquet") == 0
+    assert rhp(monkeypatch, "demos", "rebuild", "c.parquet", "--out", "r.parquet") == 0
+    assert rhp(monkeypatch, "demos", "verify", "c.parquet", "r.parquet") == 0
+    assert "6 of 6 plans reach the goal again." in capsys.readouterr().out
+
+    # Plans for other tasks do not reach these tasks' goals.
+    table = pq.read_table(shard)
+    tasks = table.column_names.index("task")
+    other = table.set_column(tasks, "task", pa.array([100, 101, 102]))
+    pq.write_table(other, shard)
+    assert rhp(monkeypatch, "demos", "verify", "data", "--workers", "1") == 1
+    assert "0 of 3 plans reach the goal again." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--plans 3", "rhp demos: --plans and --out say what to make, and where."),
+        ("--plans 3 --out /dev/null/x", "/dev/null/x: no folder can be made: "),
+        ("--plans 3 --out x --method guided", "--method guided: needs --weights."),
+        ("--plans 3 --out x --weights w", "--weights: the RRT needs none; "),
+        ("--plans 3 --out x --method rhp --weights w", "w: there is no such file "),
+        ("verify nothing", "nothing: there is no such file."),
+        ("verify .", ". holds no demonstrations (tasks_*.parquet)."),
+        ("compact nothing --out x", "nothing: there is no such file."),
+        ("rebuild nothing --out x", "nothing: there is no such file."),
+    ],
+)
+def test_demos_reports_bad_input(arguments, message, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert rhp(monkeypatch, "demos", *arguments.split()) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith(f"rhp: {message}")
+    assert not list(tmp_path.iterdir())

@@ -1,14 +1,15 @@
 """Work on a Ray cluster of two nodes on this machine, one of which dies halfway."""
 
+from functools import partial
+from pathlib import Path
+
 import pyarrow.parquet as pq
 import pytest
 
 from rhp_drake.errors import InputError
 from rhp_drake.learning.demonstration_folder import demonstrate_tasks
-from rhp_drake.learning.demonstrators import (
-    GuidedDemonstrator,
-    PlanningDemonstrator,
-)
+from rhp_drake.learning.demonstrators import PlanningDemonstrator
+from rhp_drake.value.q_network import load_q_network
 from rhp_drake.workers import RayCluster, run_over
 
 pytest.importorskip("ray")
@@ -33,13 +34,14 @@ def test_no_plan_is_lost_or_doubled_when_a_node_dies(cluster, tmp_path):
     (mortal,) = cluster.worker_nodes
     ray = RayCluster(cluster.address)
     steps = []
-    for done in demonstrate_tasks(tmp_path / "cluster", NUM_TASKS, demonstrator, ray):
+    tasks = range(NUM_TASKS)
+    for done in demonstrate_tasks(tmp_path / "cluster", tasks, demonstrator, ray):
         steps.append(done)
         if done == NUM_TASKS // 2:
             # As if someone had pulled its plug.
             cluster.remove_node(mortal, allow_graceful=False)
     assert steps == [*range(NUM_TASKS + 1)]
-    list(demonstrate_tasks(tmp_path / "alone", NUM_TASKS, demonstrator, 1))
+    list(demonstrate_tasks(tmp_path / "alone", tasks, demonstrator, 1))
     ours, alone = (
         pq.read_table(tmp_path / name).drop_columns("seconds")
         for name in ("cluster", "alone")
@@ -49,7 +51,8 @@ def test_no_plan_is_lost_or_doubled_when_a_node_dies(cluster, tmp_path):
 
 
 def test_errors_come_back(cluster, tmp_path):
-    weights = tmp_path / "nothing.safetensors"
-    work = GuidedDemonstrator(11, 3, weights).demonstrate
-    with pytest.raises(InputError, match="no such file of weights"):
-        list(run_over(work, [0, 1], RayCluster(cluster.address)))
+    ray = RayCluster(cluster.address)
+    with pytest.raises(InputError, match="nothing: there is no such file of weights"):
+        list(run_over(partial(load_q_network, num_objects=3), [Path("nothing")], ray))
+    with pytest.raises(InputError, match="no Ray cluster at"):
+        list(run_over(int, ["1"], RayCluster("127.0.0.1:1")))

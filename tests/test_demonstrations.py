@@ -32,7 +32,7 @@ from rhp_drake.planning.search import SearchRecord
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.resources import models_path
 from rhp_drake.task import goals_reached
-from rhp_drake.value.q_network import QNetwork
+from rhp_drake.value.q_network import QNetwork, load_q_network
 
 DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
 NUM_TASKS = 12
@@ -41,7 +41,7 @@ NUM_TASKS = 12
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("demonstrations")
-    assert list(demonstrate_tasks(path, NUM_TASKS, DEMONSTRATOR, 1, "abc")) == [
+    assert list(demonstrate_tasks(path, range(NUM_TASKS), DEMONSTRATOR, 1, "abc")) == [
         *range(NUM_TASKS + 1)
     ]
     return path
@@ -62,12 +62,12 @@ class Counts:
 
     seed: int = 3
     num_objects: int = 3
-    first_task: int = 250
     fails_at: tuple[int, ...] = ()
-    seconds: float = field(default=0.0, repr=False)
+    blocks_at: int | None = field(default=None, repr=False)
 
     def demonstrate(self, task):
-        time.sleep(self.seconds)
+        while task == self.blocks_at:
+            time.sleep(0.01)
         if task in self.fails_at:
             raise PushModelError("the solver gave up")
         instance = training_task(self.seed, task, self.num_objects)
@@ -80,6 +80,11 @@ class Counts:
             search=SearchRecord(12).search(),
             seconds=0.25,
         )
+
+
+def run(folder, num_tasks, demonstrator):
+    """How many tasks are done after each step, of the first ones from 250 on."""
+    return list(demonstrate_tasks(folder, range(250, 250 + num_tasks), demonstrator, 1))
 
 
 def test_a_row_is_a_task(folder):
@@ -102,14 +107,19 @@ def test_a_row_is_a_task(folder):
 def test_shards_fill_up_whatever_was_there(tmp_path):
     demonstrator = Counts()
     # Tasks 250 ... 299 are the rest of a shard, 300 ... 309 begin the next.
-    assert list(demonstrate_tasks(tmp_path, 3, demonstrator, 1)) == [0, 1, 2, 3]
-    assert next(iter(demonstrate_tasks(tmp_path, 60, demonstrator, 1))) == 3
-    list(demonstrate_tasks(tmp_path, 60, demonstrator, 1))
+    assert run(tmp_path, 3, demonstrator) == [
+        0,
+        1,
+        2,
+        3,
+    ]
+    assert next(demonstrate_tasks(tmp_path, range(250, 310), demonstrator, 1)) == 3
+    run(tmp_path, 60, demonstrator)
     assert [path.name for path in sorted(tmp_path.glob("*.parquet"))] == [
         "tasks_0000200.parquet",
         "tasks_0000300.parquet",
     ]
-    assert list(demonstrate_tasks(tmp_path, 10, demonstrator, 1)) == [10]
+    assert run(tmp_path, 10, demonstrator) == [10]
     table = pq.read_table(tmp_path)
     assert table["task"].to_pylist() == [*range(250, 310)]
     assert lengths(table["actions"]).tolist() == [t % 5 for t in range(250, 310)]
@@ -117,59 +127,94 @@ def test_shards_fill_up_whatever_was_there(tmp_path):
 
 
 def test_the_folder_is_the_same_whoever_fills_it(folder, tmp_path):
-    list(demonstrate_tasks(tmp_path, 5, DEMONSTRATOR, 2))
-    list(demonstrate_tasks(tmp_path, NUM_TASKS, DEMONSTRATOR, 2))
+    list(demonstrate_tasks(tmp_path, range(3, 7), DEMONSTRATOR, 2))
+    list(demonstrate_tasks(tmp_path, range(NUM_TASKS), DEMONSTRATOR, 2))
     name = "tasks_0000000.parquet"
     ours, theirs = (read_table(path / name) for path in (folder, tmp_path))
     assert without_times(ours).equals(without_times(theirs))
 
 
-def test_work_killed_at_any_moment_goes_on(tmp_path):
-    code = (
-        "from pathlib import Path; from test_demonstrations import Counts;"
-        "from rhp_drake.learning.demonstration_folder import demonstrate_tasks;"
-        f"path = Path({str(tmp_path)!r});"
-        "list(demonstrate_tasks(path, 200, Counts(seconds=0.01), 1))"
+KILLED = """
+from pathlib import Path
+from rhp_drake.learning.demonstration_folder import demonstrate_tasks
+from test_demonstrations import Counts
+if __name__ == "__main__":
+    counts = Counts(blocks_at=270)
+    list(demonstrate_tasks(Path("FOLDER"), range(250, 450), counts, WORKERS))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_work_stopped_at_any_moment_goes_on(tmp_path, number, workers):
+    folder, script = tmp_path / "folder", tmp_path / "work.py"
+    script.write_text(
+        KILLED.replace("FOLDER", str(folder)).replace("WORKERS", str(workers))
     )
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
-    worker = subprocess.Popen([sys.executable, "-c", code], env=environment)
-    while worker.poll() is None and len([*tmp_path.rglob("task*.parquet")]) < 20:
+    worker = subprocess.Popen(
+        [sys.executable, script],
+        env=environment,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    while worker.poll() is None and len([*folder.rglob("task_*.parquet")]) < 20:
         time.sleep(0.01)
-    assert worker.poll() is None
-    worker.send_signal(signal.SIGKILL)
+    with pytest.raises(InputError, match="another process works there"):
+        next(demonstrate_tasks(folder, range(250, 450), Counts(), 1))
+    worker.send_signal(number)
     worker.wait()
-    done = {path.stem for path in tmp_path.rglob("task_*.parquet")}
-    assert len(done) >= 15
-    steps = list(demonstrate_tasks(tmp_path, 200, Counts(), 1))
-    assert len(done) <= steps[0] < 200
+    # Its workers do not outlive it.
+    while subprocess.run(["pgrep", "--session", str(worker.pid)]).returncode == 0:  # noqa: PLW1510
+        time.sleep(0.01)
+
+    steps = list(demonstrate_tasks(folder, range(250, 450), Counts(), 1))
+    assert 20 <= steps[0] < 200
     assert steps[-1] == 200
-    assert pq.read_table(tmp_path)["task"].to_pylist() == [*range(250, 450)]
+    assert pq.read_table(folder)["task"].to_pylist() == [*range(250, 450)]
 
 
 def test_death_between_writing_a_shard_and_removing_its_parts_doubles_nothing(tmp_path):
-    list(demonstrate_tasks(tmp_path, 4, Counts(), 1))
+    run(tmp_path, 4, Counts())
     shard = read_table(tmp_path / "tasks_0000200.parquet")
     pq.write_table(shard.slice(1, 1), tmp_path / "_single/task_0000251.parquet")
-    (tmp_path / "_single/task_0000254.parquet.12.tmp").write_bytes(b"half a task")
-    assert list(demonstrate_tasks(tmp_path, 4, Counts(), 1)) == [4]
+    for path in (tmp_path / "_single", tmp_path):
+        (path / ".tasks_0000200.parquet.12.tmp").write_bytes(b"half a file")
     assert pq.read_table(tmp_path)["task"].to_pylist() == [250, 251, 252, 253]
+    assert run(tmp_path, 4, Counts()) == [4]
+    assert pq.read_table(tmp_path)["task"].to_pylist() == [250, 251, 252, 253]
+
+
+def test_a_damaged_single_is_done_again(tmp_path, caplog):
+    run(tmp_path, 2, Counts())
+    (tmp_path / "_single/task_0000252.parquet").write_bytes(b"half a task")
+    assert run(tmp_path, 3, Counts()) == [2, 3]
+    assert "The task is done again" in caplog.text
+
+
+def test_commits_are_noted(tmp_path):
+    for end, commit in ((252, "a"), (254, "b"), (256, "a")):
+        list(demonstrate_tasks(tmp_path, range(250, end), Counts(), 1, commit))
+    assert describe(tmp_path)["commit"] == "a, b"
 
 
 def test_a_folder_is_one_demonstrator_s(folder):
     other = PlanningDemonstrator(seed=12, num_objects=3)
     with pytest.raises(InputError, match="seed=11"):
-        next(demonstrate_tasks(folder, NUM_TASKS, other, 1))
+        next(demonstrate_tasks(folder, range(2), other, 1))
 
 
 def test_a_failure_of_the_physics_costs_one_task(tmp_path, caplog):
-    list(demonstrate_tasks(tmp_path, 10, Counts(fails_at=(257,)), 1))
+    run(tmp_path, 10, Counts(fails_at=(257,)))
     assert "task 257 is left out: the solver gave up" in caplog.text
     row = pq.read_table(tmp_path).to_pylist()[7]
     assert row["failure"] == "the solver gave up"
     assert not row["solved"]
     assert row["actions"] == []
     # It is not tried again.
-    assert list(demonstrate_tasks(tmp_path, 10, Counts(fails_at=(257,)), 1)) == [10]
+    assert list(
+        demonstrate_tasks(tmp_path, range(250, 260), Counts(fails_at=(257,)), 1)
+    ) == [10]
 
 
 def test_bad_files_are_named(folder, tmp_path):
@@ -278,6 +323,19 @@ def test_seeds_and_actions_rebuild_the_states(folder, tmp_path):
     assert replay.identical is None
 
 
+def test_compact_files_do_for_replay_only(folder, tmp_path):
+    small = tmp_path / "compact.parquet"
+    compact([folder / "tasks_0000000.parquet"], small)
+    with pytest.raises(InputError, match=r"lacks the column goals; .* rebuild"):
+        load_demonstrations([small])
+    list(demonstrate_tasks(tmp_path / "two", range(2), Counts(num_objects=2), 1))
+    with pytest.raises(InputError, match="different numbers of objects"):
+        compact([small, tmp_path / "two/tasks_0000000.parquet"], tmp_path / "mixed")
+    pq.write_table(pq.read_table(small).slice(0, 0), small)
+    with pytest.raises(InputError, match="holds no plans"):
+        rebuild(small, tmp_path / "full.parquet")
+
+
 def test_verification_notices_a_wrong_plan(folder, tmp_path):
     table = pq.read_table(folder)
     actions = table["actions"].to_pylist()
@@ -301,12 +359,11 @@ def equal(made, again):
         np.testing.assert_array_equal(array, getattr(again.search, name), err_msg=name)
 
 
-def test_rhp_demonstrates_with_all_its_roll_outs(tmp_path):
-    weights = tmp_path / "weights.safetensors"
+def test_rhp_demonstrates_with_all_its_roll_outs():
     torch.manual_seed(0)
-    QNetwork(3).save(weights)
+    network = QNetwork(3)
     made, again = (
-        RecedingHorizonDemonstrator(11, 3, weights).demonstrate(2) for _ in range(2)
+        RecedingHorizonDemonstrator(11, network).demonstrate(2) for _ in range(2)
     )
     equal(made, again)
     search = made.search
@@ -320,8 +377,8 @@ def test_rhp_demonstrates_with_all_its_roll_outs(tmp_path):
 
 
 def test_the_guided_search_demonstrates():
-    weights = models_path() / "q_network/three_boxes.safetensors"
-    made, again = (GuidedDemonstrator(11, 3, weights).demonstrate(2) for _ in range(2))
+    network = load_q_network(models_path() / "q_network/three_boxes.safetensors", 3)
+    made, again = (GuidedDemonstrator(11, network).demonstrate(2) for _ in range(2))
     equal(made, again)
     assert goals_reached(made.states[-1], made.instance.goals)
     assert len(made.actions) <= len(DEMONSTRATOR.demonstrate(2).actions)

@@ -34,7 +34,7 @@ DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("demonstrations")
-    list(demonstrate_tasks(path, 25, DEMONSTRATOR, 1))
+    list(demonstrate_tasks(path, range(25), DEMONSTRATOR, 1))
     return load_demonstrations([path])
 
 

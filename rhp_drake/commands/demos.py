@@ -13,14 +13,11 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from rhp_drake.learning.demonstration import Demonstrator
-    from rhp_drake.workers import Workers
 
 demos = typer.Typer(invoke_without_command=True)
 
-_Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
-_Ray = Annotated[
-    str | None,
-    typer.Option("--ray", help='Address of a Ray cluster to work on, or "auto".'),
+_Workers = Annotated[
+    int, typer.Option(min=1, help="How many processes work on this machine.")
 ]
 _Sources = Annotated[
     list[Path], typer.Argument(help="Files or folders of demonstrations.")
@@ -40,9 +37,11 @@ def make(
     context: typer.Context,
     *,
     plans: Annotated[
-        int | None, typer.Option(min=1, help="Training tasks to solve.")
+        int | None, typer.Option(min=1, help="How many training tasks to solve.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the files.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the demonstrations.")
+    ] = None,
     method: Annotated[
         Method,
         typer.Option(
@@ -51,17 +50,27 @@ def make(
         ),
     ] = Method.RRT,
     weights: Annotated[
-        Path | None, typer.Option(help="Of the Q-network, for guided and rhp.")
+        Path | None, typer.Option(help="The Q-network of guided and rhp, a file.")
     ] = None,
-    first_task: Annotated[int, typer.Option(min=0, help="Its number.")] = 0,
+    first_task: Annotated[
+        int, typer.Option(min=0, help="The number of the first task.")
+    ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
-    objects: Annotated[int, typer.Option(min=1, help="m.")] = 3,
+    objects: Annotated[
+        int, typer.Option(min=1, max=10, help="How many boxes the tasks have.")
+    ] = 3,
     workers: _Workers = 2,
-    ray: _Ray = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            help='Work on the Ray cluster at this address instead; "auto" for the one '
+            "that this machine is part of."
+        ),
+    ] = None,
 ) -> None:
     """Makes demonstrations: plans and all that was simulated to find them.
 
-    Stopped at any moment, the same command goes on where it was.
+    You may stop this at any moment: the same command goes on where it was.
     """
     if context.invoked_subcommand is not None:
         return
@@ -75,20 +84,27 @@ def make(
         shard_paths,
     )
     from rhp_drake.run_record import source_commit
+    from rhp_drake.workers import RayCluster
 
-    demonstrator = _demonstrator(method, weights, seed, objects, first_task)
+    demonstrator = _demonstrator(method, weights, seed, objects)
+    tasks = range(first_task, first_task + plans)
+    who = workers if ray is None else RayCluster(ray)
     console = Console(highlight=False, soft_wrap=True)
-    with make_progress(console) as progress:
-        bar = progress.add_task("Plans", total=plans)
-        for done in demonstrate_tasks(
-            out, plans, demonstrator, _who(workers, ray), source_commit()
-        ):
-            progress.update(bar, completed=done)
+    try:
+        with make_progress(console) as progress:
+            bar = progress.add_task("Tasks", total=plans)
+            for done in demonstrate_tasks(
+                out, tasks, demonstrator, who, source_commit()
+            ):
+                progress.update(bar, completed=done)
+    except KeyboardInterrupt:
+        console.print("Stopped; the same command goes on from here.")
+        raise typer.Exit(130) from None
     _print_summary(shard_paths([out]), console)
 
 
 def _demonstrator(
-    method: Method, weights: Path | None, seed: int, num_objects: int, first_task: int
+    method: Method, weights: Path | None, seed: int, num_objects: int
 ) -> "Demonstrator":
     from rhp_drake.learning.demonstrators import (
         GuidedDemonstrator,
@@ -100,19 +116,13 @@ def _demonstrator(
     if method == Method.RRT:
         if weights is not None:
             raise InputError("--weights: the RRT needs none; use --method.")
-        return PlanningDemonstrator(seed, num_objects, first_task)
+        return PlanningDemonstrator(seed, num_objects)
     if weights is None:
         raise InputError(f"--method {method}: needs --weights.")
-    load_q_network(weights, num_objects)  # Bad weights are better found out here.
+    q_network = load_q_network(weights, num_objects)
     if method == Method.GUIDED:
-        return GuidedDemonstrator(seed, num_objects, weights, first_task)
-    return RecedingHorizonDemonstrator(seed, num_objects, weights, first_task)
-
-
-def _who(workers: int, ray: str | None) -> "Workers":
-    from rhp_drake.workers import RayCluster
-
-    return workers if ray is None else RayCluster(ray)
+        return GuidedDemonstrator(seed, q_network)
+    return RecedingHorizonDemonstrator(seed, q_network)
 
 
 def _print_summary(paths: list[Path], console: "Console") -> None:
@@ -122,7 +132,6 @@ def _print_summary(paths: list[Path], console: "Console") -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    from rhp_drake.evaluation.machine import describe_machine
     from rhp_drake.evaluation.statistics import format_rate
     from rhp_drake.learning.demonstration_files import lengths, read_table
 
@@ -151,14 +160,14 @@ def _print_summary(paths: list[Path], console: "Console") -> None:
         f"{int(solved.sum()) / max(hours, 1e-9):.0f} plans an hour and core; "
         f"{size / 1e6:.1f} MB in {len(paths)} files of {paths[0].parent}."
     )
-    console.print(describe_machine())
 
 
 @demos.command()
-def verify(sources: _Sources, *, workers: _Workers = 2, ray: _Ray = None) -> None:
+def verify(sources: _Sources, *, workers: _Workers = 2) -> None:
     """Executes stored plans again, and says how many still reach the goal.
 
-    The exit status is 0 if all do, 1 if not.
+    The exit status is 0 if all do, 1 if not: their states may differ a little, for
+    instance on another processor.
     """
     from rich.console import Console
 
@@ -171,7 +180,7 @@ def verify(sources: _Sources, *, workers: _Workers = 2, ray: _Ray = None) -> Non
     replays = []
     with make_progress(console) as progress:
         bar = progress.add_task("Files", total=len(paths))
-        for replay in verify_files(paths, _who(workers, ray)):
+        for replay in verify_files(paths, workers):
             replays.append(replay)
             progress.advance(bar)
     plans = sum(replay.num_plans for replay in replays)

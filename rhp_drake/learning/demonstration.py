@@ -38,18 +38,18 @@ class Demonstration:
 class Demonstrator(Protocol):
     """Whoever solves training tasks; it is sent to other processes.
 
-    Attributes:
-        seed: Of the tasks and of its own draws.
-        num_objects: m.
-        first_task: The number of its first task.
+    Its `repr` tells it from every other one: whose repr is the same does the same.
     """
 
     @property
-    def seed(self) -> int: ...  # noqa: D102
+    def seed(self) -> int:
+        """Of the tasks and of its own draws."""
+        ...
+
     @property
-    def num_objects(self) -> int: ...  # noqa: D102
-    @property
-    def first_task(self) -> int: ...  # noqa: D102
+    def num_objects(self) -> int:
+        """The m of its tasks."""
+        ...
 
     def demonstrate(self, task: int) -> Demonstration:
         """Solves a task, or fails to; depends on nothing but its number."""

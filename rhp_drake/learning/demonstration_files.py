@@ -18,7 +18,10 @@
 All but `seconds` depend on the demonstrator and the task alone.  A folder of them is
 one table: ``pyarrow.parquet.read_table(folder)``, or ``pandas.read_parquet(folder)``.
 The schema's metadata has the key "rhp_drake": JSON with the schema's version, m, the
-demonstrator and the commit of the code.  Pages carry checksums.
+demonstrator and the commit of the code (several, if it changed meanwhile).  Pages carry
+checksums.
+
+A compact file has the columns `seed`, `task`, `solved` and `actions` only.
 """
 
 from collections.abc import Sequence
@@ -130,7 +133,8 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
     """Reads a file of demonstrations, or some of its columns.
 
     Raises:
-        InputError: If it is damaged or something else; the message names it.
+        InputError: If it is damaged, something else, or lacks a column; the message
+            names it.
     """
     try:
         # Checksums are verified on the way.
@@ -144,10 +148,18 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
                 f"{path}: has version {schema} of the schema of demonstrations; this "
                 f"code reads {SCHEMA_VERSION}."
             )
+        lacking = set(columns or ()) - set(file.schema_arrow.names)
+        if lacking:
+            raise InputError(
+                f"{path}: lacks the column {min(lacking)}; if it is compact, "
+                "`rhp demos rebuild` restores the states."
+            )
         return file.read(columns)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file.") from None
-    except (OSError, pa.ArrowException, KeyError, json.JSONDecodeError) as error:
+    except InputError:
+        raise
+    except (OSError, ValueError, TypeError, KeyError, pa.ArrowException) as error:
         raise InputError(
             f"{path}: not a readable file of demonstrations ({error})."
         ) from error
@@ -156,6 +168,33 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
 def about(table: pa.Table) -> dict[str, Any]:
     """What the metadata says: "schema", "num_objects", "demonstrator", "commit"."""
     return json.loads(table.schema.metadata[METADATA_KEY])
+
+
+def join_tables(tables: Sequence[pa.Table]) -> pa.Table:
+    """One table, its rows in the order of their tasks; of a task twice, the last.
+
+    Its metadata name all demonstrators and commits of the tables.
+
+    Raises:
+        InputError: If the tables are of different numbers of objects.
+    """
+    details = [about(table) for table in tables]
+    if len({d["num_objects"] for d in details}) > 1:
+        raise InputError("the demonstrations are of different numbers of objects.")
+    rows = {
+        (seed, task): table.slice(row, 1)
+        for table in tables
+        for row, (seed, task) in enumerate(
+            zip(table["seed"].to_pylist(), table["task"].to_pylist(), strict=True)
+        )
+    }
+    joined = pa.concat_tables([rows[key] for key in sorted(rows)]).combine_chunks()
+    commits = [commit for d in details for commit in d["commit"].split(", ")]
+    metadata = details[0] | {
+        "demonstrator": " and ".join(dict.fromkeys(d["demonstrator"] for d in details)),
+        "commit": ", ".join(dict.fromkeys(commits)),
+    }
+    return joined.replace_schema_metadata({METADATA_KEY: json.dumps(metadata).encode()})
 
 
 def numbers(column: pa.ChunkedArray) -> np.ndarray:

@@ -9,7 +9,6 @@ number alone, the folder comes out the same, `seconds` aside, whoever worked on 
 from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import partial
-import json
 import logging
 from pathlib import Path
 import time
@@ -18,7 +17,7 @@ from typing import Any, Final
 import pyarrow as pa
 
 from rhp_drake.errors import InputError
-from rhp_drake.files import make_folder, write_atomically
+from rhp_drake.files import exclusive, make_folder
 from rhp_drake.learning.demonstration import (
     Demonstration,
     Demonstrator,
@@ -26,6 +25,7 @@ from rhp_drake.learning.demonstration import (
 )
 from rhp_drake.learning.demonstration_files import (
     about,
+    join_tables,
     read_table,
     to_table,
     write_table,
@@ -38,22 +38,21 @@ _logger = logging.getLogger("rhp_drake")
 
 TASKS_PER_SHARD: Final = 100
 # Readers of Parquet folders skip names that begin with an underscore.
-_DESCRIPTION: Final = "_demonstrator.json"
 _SINGLE: Final = "_single"
 
 
 def demonstrate_tasks(
     folder: Path,
-    num_tasks: int,
+    tasks: range,
     demonstrator: Demonstrator,
     workers: Workers,
     commit: str = "unknown",
 ) -> Iterator[int]:
-    """Does those of the demonstrator's first `num_tasks` tasks that `folder` lacks.
+    """Does those tasks that `folder` lacks.
 
     Args:
-        folder: Made if need be.
-        num_tasks: May be more, or fewer, than at an earlier time.
+        folder: Made if need be; it may hold other tasks of the same demonstrator.
+        tasks: Their numbers.
         demonstrator: The one whose work the folder holds, if it holds any.
         workers: Who does it.
         commit: Of the code, to be noted.
@@ -62,35 +61,39 @@ def demonstrate_tasks(
         The number of tasks done, at the beginning and after each.
 
     Raises:
-        InputError: If the folder holds the work of another demonstrator, or a file of
-            it cannot be read.
+        InputError: If the folder holds the work of another demonstrator, a file of it
+            cannot be read, or another process works there.
+        WorkError: If a worker dies or a file cannot be written; nothing is lost.
     """
-    make_folder(folder / _SINGLE)
-    description = {"demonstrator": repr(demonstrator)}
-    known = _read_description(folder)
-    if known not in ({}, description):
-        raise InputError(f"{folder} holds the work of {known}.")
-    write_atomically(folder / _DESCRIPTION, json.dumps(description) + "\n")
-    _join_singles(folder)
-
-    first = demonstrator.first_task
-    tasks = range(first, first + num_tasks)
-    missing = set(tasks) - _tasks_done(folder)
-    yield num_tasks - len(missing)
-    work = partial(_demonstrate, demonstrator=demonstrator)
-    try:
-        for task, done in run_over(work, sorted(missing), workers):
-            if done.failure:
-                _logger.warning("task %d is left out: %s", task, done.failure)
-            table = to_table([done], description | {"commit": commit})
-            write_table(_single_path(folder, task), table)
-            missing.remove(task)
-            begin = task // TASKS_PER_SHARD * TASKS_PER_SHARD
-            if missing.isdisjoint(range(begin, begin + TASKS_PER_SHARD)):
-                _join_singles(folder)
-            yield num_tasks - len(missing)
-    finally:
+    with exclusive(folder):
+        make_folder(folder / _SINGLE)
         _join_singles(folder)
+        _check_demonstrator(folder, demonstrator)
+        missing = set(tasks) - _tasks_done(folder)
+        yield len(tasks) - len(missing)
+        work = partial(_demonstrate, demonstrator=demonstrator)
+        details = {"demonstrator": repr(demonstrator), "commit": commit}
+        try:
+            for task, done in run_over(work, sorted(missing), workers):
+                if done.failure:
+                    _logger.warning("task %d is left out: %s", task, done.failure)
+                write_table(_single_path(folder, task), to_table([done], details))
+                missing.remove(task)
+                begin = task // TASKS_PER_SHARD * TASKS_PER_SHARD
+                if missing.isdisjoint(range(begin, begin + TASKS_PER_SHARD)):
+                    _join_singles(folder)
+                yield len(tasks) - len(missing)
+        finally:
+            _join_singles(folder)
+
+
+def _check_demonstrator(folder: Path, demonstrator: Demonstrator) -> None:
+    for path in sorted(folder.glob("tasks_*.parquet"))[:1]:
+        known = describe(path)["demonstrator"]
+        if known != repr(demonstrator):
+            raise InputError(
+                f"{folder} holds the work of {known}, not of {demonstrator!r}."
+            )
 
 
 # A process keeps its demonstrator from task to task, because its push model is dear.
@@ -140,33 +143,21 @@ def _tasks_done(folder: Path) -> set[int]:
 
 def _join_singles(folder: Path) -> None:
     """Moves the tasks that have files of their own to their shards."""
-    singles = sorted((folder / _SINGLE).glob("task_*.parquet"))
     shards: dict[Path, list[Path]] = {}
-    for path in singles:
-        task = int(path.stem.removeprefix("task_"))
+    for path in sorted((folder / _SINGLE).glob("task_*.parquet")):
+        try:
+            (task,) = _tasks(read_table(path))
+        except InputError as error:
+            _logger.warning("%s  The task is done again.", error)
+            path.unlink()
+            continue
         shards.setdefault(_shard_path(folder, task), []).append(path)
     for shard, paths in shards.items():
         sources = [shard, *paths] if shard.exists() else paths
         # A task is in both if work was killed between the next two steps.
-        rows = {
-            task: table.slice(row, 1)
-            for table in map(read_table, sources)
-            for row, task in enumerate(_tasks(table))
-        }
-        table = pa.concat_tables([rows[task] for task in sorted(rows)])
-        write_table(shard, table.combine_chunks())
+        write_table(shard, join_tables([read_table(path) for path in sources]))
         for path in paths:
             path.unlink()
-
-
-def _read_description(folder: Path) -> dict[str, str]:
-    path = folder / _DESCRIPTION
-    if not path.exists():
-        return {}
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a readable description ({error}).") from error
 
 
 def shard_paths(paths: Sequence[Path]) -> list[Path]:

@@ -46,6 +46,16 @@ class Demonstrations:
     solved: np.ndarray
 
 
+_COLUMNS: Final = (
+    "initial_state",
+    "goals",
+    "solved",
+    "actions",
+    "states",
+    "search_actions",
+    "search_origins",
+    "search_next_states",
+)
 # Arrays that hold indices, and the array whose rows they count.
 _INDICES: Final = {
     "plan_tasks": "goals",
@@ -60,7 +70,9 @@ def load_demonstrations(paths: Sequence[Path]) -> Demonstrations:
     Raises:
         InputError: If a file cannot be read, or there is none.
     """
-    return _concatenate([_flatten(read_table(path)) for path in shard_paths(paths)])
+    return _concatenate(
+        [_flatten(read_table(path, _COLUMNS)) for path in shard_paths(paths)]
+    )
 
 
 def _flatten(table: pa.Table) -> Demonstrations:

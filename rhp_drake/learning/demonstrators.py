@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 import time
 from typing import Final
 
@@ -12,7 +11,7 @@ from rhp_drake.learning.demonstration import Demonstration, training_task
 from rhp_drake.planning.best_first import plan_best_first
 from rhp_drake.planning.kinodynamic_rrt import plan
 from rhp_drake.planning.policy import PolicyError
-from rhp_drake.planning.receding_horizon import RecedingHorizon, ValueFunction
+from rhp_drake.planning.receding_horizon import RecedingHorizon
 from rhp_drake.planning.search import Plan, Search, SearchRecord
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import TRAINING, stream
@@ -23,7 +22,7 @@ from rhp_drake.task import (
     goals_reached,
     objects_fallen,
 )
-from rhp_drake.value.q_network import load_q_network
+from rhp_drake.value.q_network import QNetwork
 
 # A task not solved with this many simulated actions yields its trees but no plan.
 _MAX_TRANSITIONS: Final = 6000
@@ -36,12 +35,10 @@ class PlanningDemonstrator:
     Attributes:
         seed: Of the tasks and the searches.
         num_objects: m.
-        first_task: Number of the first task.
     """
 
     seed: int
     num_objects: int
-    first_task: int = 0
 
     @cached_property
     def _push_model(self) -> PushModel:
@@ -66,30 +63,27 @@ class GuidedDemonstrator:
 
     Attributes:
         seed: Of the tasks.
-        num_objects: m.
-        weights: File of the Q-network.
-        first_task: Number of the first task.
+        q_network: Proposes; its m is that of the tasks.
     """
 
     seed: int
-    num_objects: int
-    weights: Path
-    first_task: int = 0
+    q_network: QNetwork
+
+    @property
+    def num_objects(self) -> int:
+        """See `demonstration.Demonstrator`."""
+        return self.q_network.num_objects
 
     @cached_property
     def _push_model(self) -> PushModel:
         return PushModel(self.num_objects)
-
-    @cached_property
-    def _q_network(self) -> ValueFunction:
-        return load_q_network(self.weights, self.num_objects)
 
     def demonstrate(self, task: int) -> Demonstration:
         """See `demonstration.Demonstrator`."""
         instance = training_task(self.seed, task, self.num_objects)
         found = plan_best_first(
             self._push_model,
-            self._q_network,
+            self.q_network,
             instance.initial_state,
             instance.goals,
             max_transitions=_MAX_TRANSITIONS,
@@ -103,19 +97,20 @@ class RecedingHorizonDemonstrator:
 
     Attributes:
         seed: Of the tasks and the policy.
-        num_objects: m.
-        weights: File of the Q-network.
-        first_task: Number of the first task.
+        q_network: RHP's; its m is that of the tasks.
         epsilon: How often the action is a random one.
         temperature: tau of Eq. 5, in actions.
     """
 
     seed: int
-    num_objects: int
-    weights: Path
-    first_task: int = 0
+    q_network: QNetwork
     epsilon: float = 0.1
     temperature: float = 0.5
+
+    @property
+    def num_objects(self) -> int:
+        """See `demonstration.Demonstrator`."""
+        return self.q_network.num_objects
 
     @cached_property
     def _recorder(self) -> "_RecordingPushModel":
@@ -123,8 +118,7 @@ class RecedingHorizonDemonstrator:
 
     @cached_property
     def _policy(self) -> RecedingHorizon:
-        q_network = load_q_network(self.weights, self.num_objects)
-        return RecedingHorizon(self._recorder, q_network, 6, 6, self.temperature)
+        return RecedingHorizon(self._recorder, self.q_network, 6, 6, self.temperature)
 
     def demonstrate(self, task: int) -> Demonstration:
         """See `demonstration.Demonstrator`."""

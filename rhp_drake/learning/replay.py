@@ -13,10 +13,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from rhp_drake.errors import InputError
 from rhp_drake.learning.demonstration import Demonstration, training_task
 from rhp_drake.learning.demonstration_files import (
     COMPACT_COLUMNS,
     about,
+    join_tables,
     lengths,
     numbers,
     read_table,
@@ -24,9 +26,9 @@ from rhp_drake.learning.demonstration_files import (
     write_table,
 )
 from rhp_drake.planning.search import SearchRecord
-from rhp_drake.push_model.transition import PushModel
+from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.task import goals_reached
-from rhp_drake.workers import Workers, run_over
+from rhp_drake.workers import run_over
 
 
 @dataclass(frozen=True)
@@ -45,13 +47,13 @@ class Replay:
     identical: int | None
 
 
-def verify(paths: Sequence[Path], workers: Workers) -> Iterator[Replay]:
+def verify(paths: Sequence[Path], num_workers: int) -> Iterator[Replay]:
     """Executes the plans of some files again, and yields a file's result at a time.
 
     Raises:
         InputError: If a file cannot be read; the message names it.
     """
-    for _, replay in run_over(_verify, paths, workers):
+    for _, replay in run_over(_verify, paths, num_workers):
         yield replay
 
 
@@ -77,10 +79,9 @@ def compact(paths: Sequence[Path], out: Path) -> int:
     Raises:
         InputError: If a file cannot be read; the message names it.
     """
-    tables = [read_table(path, COMPACT_COLUMNS) for path in paths]
-    table = pa.concat_tables(tables)
+    table = join_tables([read_table(path, COMPACT_COLUMNS) for path in paths])
     table = table.filter(table["solved"])
-    write_table(out, table.combine_chunks())
+    write_table(out, table)
     return table.num_rows
 
 
@@ -91,10 +92,12 @@ def rebuild(path: Path, out: Path) -> int:
         The number of plans.
 
     Raises:
-        InputError: If the file cannot be read.
+        InputError: If the file cannot be read, or holds no plans.
     """
-    table = read_table(path)
+    table = read_table(path, COMPACT_COLUMNS)
     rebuilt = _rebuild(table)
+    if not rebuilt:
+        raise InputError(f"{path}: holds no plans.")
     details = {k: v for k, v in about(table).items() if k in ("demonstrator", "commit")}
     write_table(out, to_table(rebuilt, details))
     return len(rebuilt)
@@ -118,11 +121,15 @@ def _rebuild(table: pa.Table) -> list[Demonstration]:
     actions = np.split(numbers(table["actions"]).astype(int), np.cumsum(num_actions))
     states = [[instance.initial_state] for instance in instances]
     for k in range(int(num_actions.max(initial=0))):
-        rows = np.flatnonzero(num_actions > k)
+        # Plans end, and at an action that the push model refuses they stop.
+        rows = [r for r, s in enumerate(states) if len(s) == k + 1 <= num_actions[r]]
+        if not rows:
+            break
         present = np.array([states[row][-1] for row in rows])
-        following = push_model.step(present, np.array([actions[r][k] for r in rows]))
+        following = _step(push_model, present, np.array([actions[r][k] for r in rows]))
         for row, state in zip(rows, following, strict=True):
-            states[row].append(state)
+            if np.isfinite(state).all():
+                states[row].append(state)
     solved = table["solved"].to_pylist()
     return [
         Demonstration(
@@ -136,3 +143,19 @@ def _rebuild(table: pa.Table) -> list[Demonstration]:
         )
         for row in range(table.num_rows)
     ]
+
+
+def _step(push_model: PushModel, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """`PushModel.step`, with nan where it refuses a state."""
+    try:
+        return push_model.step(states, actions)
+    except PushModelError:
+        if len(states) == 1:
+            return np.full_like(states, np.nan)
+    half = len(states) // 2
+    return np.concatenate(
+        [
+            _step(push_model, states[:half], actions[:half]),
+            _step(push_model, states[half:], actions[half:]),
+        ]
+    )

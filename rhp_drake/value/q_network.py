@@ -4,6 +4,7 @@ A file is in the safetensors format, which cannot execute code; its metadata say
 what the weights are for and where they come from.
 """
 
+from hashlib import sha256
 from itertools import pairwise
 import json
 from pathlib import Path
@@ -42,6 +43,13 @@ class QNetwork(nn.Module):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
         layers.append(nn.Linear(widths[-1], NUM_ACTIONS))
         self.layers = nn.Sequential(*layers)
+
+    def __repr__(self) -> str:
+        """Tells networks apart: by the SHA-256 of their weights."""
+        digest = sha256()
+        for tensor in self.state_dict().values():
+            digest.update(tensor.cpu().contiguous().numpy().tobytes())
+        return f"QNetwork({self.num_objects}, sha256={digest.hexdigest()[:16]})"
 
     def forward(self, states: torch.Tensor, goals: torch.Tensor) -> torch.Tensor:
         """Values (N, 6) for states (N, 3 + 3 m) and goals (N, m, 2)."""
