@@ -98,13 +98,26 @@ def test_trials_and_results():
     for result in results.values():
         assert result.solved
         assert result.num_transitions >= result.num_actions > 0
+        assert 0 < result.first_seconds < result.seconds
 
 
 def test_a_plan_that_leads_nowhere_solves_nothing(monkeypatch):
-    nowhere = planners.Found(np.array([Action.CLOCKWISE]), 1, 0.0)
+    nowhere = planners.Found(np.array([Action.CLOCKWISE]), 1, 0.0, 0.0)
     monkeypatch.setitem(planners.PLANNERS, "nowhere", lambda *_: nowhere)
     ((_, result),) = compare_planners(["nowhere"], VALIDATION, 1, 1.0, 0, 1)
     assert not result.solved
+
+
+def test_a_plan_in_time_counts_though_its_improvement_ends_late(monkeypatch):
+    actions = np.array([Action.FORWARD] * 3)
+    monkeypatch.setattr(planners, "load_instances", lambda _: [EASY])
+    for first_seconds, solved in ((0.5, True), (1.5, False)):
+        found = planners.Found(actions, 1, 2.0, first_seconds)
+        monkeypatch.setitem(planners.PLANNERS, "late", lambda *_, found=found: found)
+        ((_, result),) = compare_planners(["late"], VALIDATION, 1, 1.0, 0, 1)
+        assert result.solved == solved
+        assert result.seconds == 2
+        assert result.first_seconds == first_seconds
 
 
 def test_bad_planners(monkeypatch):
@@ -112,12 +125,12 @@ def test_bad_planners(monkeypatch):
         check_planners(["rrt", "best"])
     monkeypatch.setattr(planners, "find_spec", lambda _: None)
     check_planners(["rrt"])
-    with pytest.raises(InputError, match="ompl_sst needs OMPL: pip install"):
+    with pytest.raises(InputError, match=r"ompl_sst needs OMPL: pip .*\[bench\]"):
         check_planners(["rrt", "ompl_sst"])
 
 
 def test_command(monkeypatch, capsys):
-    options = ["--planners=rrt", "--count=2", "--workers=1", "--time-limit=20"]
+    options = ["--planners=rrt,rrt", "--count=2", "--workers=1", "--time-limit=20"]
     monkeypatch.setattr("sys.argv", ["rhp", "bench", "planners", *options])
     with pytest.raises(SystemExit) as info:
         cli.main()
@@ -125,6 +138,8 @@ def test_command(monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "First 2 instances of the validation set" in printed
     assert "within 20 s" in printed
+    # Named twice, it runs once.
+    assert "(34.2-100.0)" in printed
 
 
 def test_command_without_ompl(monkeypatch, capsys):

@@ -1,5 +1,8 @@
 """The engines that the push model is compared with, and the measurements."""
 
+import itertools
+import time
+
 import numpy as np
 import pytest
 
@@ -92,11 +95,18 @@ def test_accuracy_of_all_engines(pairs):
     assert fine.own.mean < usual.own.mean < coarse.own.mean
 
 
-def test_profile_adds_up(pairs):
+def test_profile_adds_up(pairs, monkeypatch):
+    # A clock that goes on by a second whenever it is read.
+    monkeypatch.setattr(time, "thread_time", itertools.count().__next__)
     profile = measure_profile((pairs[0][:20], pairs[1][:20]), 3)
-    *parts, whole = [part.seconds.median for part in profile.parts]
-    assert min(parts) > 0
-    assert sum(parts) == pytest.approx(whole, rel=0.2)
+    *parts, whole = profile.parts
+    seconds = {part.name: part.seconds.median for part in profile.parts}
+    # Between the first reading and the last: two at the checks, two at each push.
+    assert whole.name == "whole push"
+    assert whole.seconds.median == pytest.approx((2 + 2 * 20 + 1) / 20)
+    assert seconds["checks of the input"] == pytest.approx(1 / 20)
+    assert sum(part.seconds.median for part in parts) == pytest.approx(43 / 20)
+    assert sum(part.share.median for part in parts) == pytest.approx(1)
     # A push has at most one for each piece of its path, and one to settle.
     assert 1 < profile.steps <= 11
 

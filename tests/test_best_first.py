@@ -78,6 +78,7 @@ def test_limits(push_model):
     assert len(found.search.actions) < 30 + 6
     found = plan_best_first(*arguments, time_limit=0.0)
     assert found.actions is None
+    assert np.isnan(found.first_seconds)
     np.testing.assert_array_equal(found.states, instance.initial_state[None])
 
 
@@ -86,3 +87,4 @@ def test_a_goal_state_needs_no_actions(push_model, q_network):
     goals = instance.initial_state[3:].reshape(-1, 3)[:, :2]
     found = plan_best_first(push_model, q_network, instance.initial_state, goals)
     assert len(found.actions) == 0
+    assert found.first_seconds == found.seconds

@@ -30,11 +30,11 @@ class FakePlanner:
         self.starts.append(state)
         search = SearchRecord(len(state)).search()
         if self.length is None:
-            return Plan(None, state[None], search, time_limit)
+            return Plan(None, state[None], search, time_limit, np.nan)
         states = np.repeat(state[None], self.length + 1, axis=0)
         states[:, 0] += task.TRANSLATION * np.arange(self.length + 1)
         states[:, 3] += task.TRANSLATION * np.arange(self.length + 1)
-        return Plan(np.zeros(self.length, int), states, search, 0.1)
+        return Plan(np.zeros(self.length, int), states, search, 0.1, 0.1)
 
 
 def run(planner, disturbances):

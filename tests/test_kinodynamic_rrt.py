@@ -108,6 +108,8 @@ def test_improvement_shortens_plans_and_ends_in_time(push_model):
     for index in range(6):
         _, first = search(push_model, index, improvement=0)
         _, better = search(push_model, index, improvement=400)
+        assert 0 < first.first_seconds <= first.seconds
+        assert 0 < better.first_seconds < better.seconds
         # The search is the same until the first plan.
         n = len(first.search.actions)
         np.testing.assert_array_equal(
@@ -133,6 +135,7 @@ def test_limit_of_transitions(push_model):
     for index in range(6):
         _, found = search(push_model, index, max_transitions=30)
         assert len(found.search.actions) < 30 + 6
+        assert np.isnan(found.first_seconds) == (found.actions is None)
 
 
 def test_open_loop_executes_its_plan_and_no_more(push_model):

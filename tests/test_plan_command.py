@@ -1,10 +1,12 @@
 """`rhp plan` as its user meets it."""
 
+from dataclasses import replace
 import json
 
 import pytest
 
 from rhp_drake import cli
+from rhp_drake.planning.kinodynamic_rrt import plan as grow_tree
 
 EASY = """
 easy:
@@ -62,7 +64,7 @@ def test_same_seed_same_plan(rhp, tmp_path, capsys):
     assert printed.err == ""
     last = f"{len(a['actions'])}   {a['actions'][-1]}"
     assert last in printed.out
-    assert "1 tree, target at best" in printed.out
+    assert f"trees, a plan of {len(a['actions'])} actions" in printed.out
 
 
 @pytest.mark.parametrize("flag", ["--open-loop", "--checked"])
@@ -95,6 +97,40 @@ def test_recording_shows_the_tree(rhp, tmp_path, monkeypatch, capsys):
     assert "/overlay/tree/1/1/target" in drawn
 
 
+@pytest.fixture
+def shown_from(monkeypatch):
+    times = []
+    monkeypatch.setattr(
+        "rhp_drake.commands.tree_drawing.TreeDrawing.show_from",
+        lambda drawing, time: times.append(time),
+    )
+    return times
+
+
+@pytest.mark.parametrize("exception", [None, KeyboardInterrupt])
+def test_a_search_in_vain_is_shown_when_it_began(
+    exception, rhp, monkeypatch, shown_from
+):
+    searches = []
+
+    def plan(push_model, state, *arguments, **options):
+        searches.append(state)
+        if len(searches) > 1:
+            if exception is not None:
+                raise exception
+            options["time_limit"] = 0.0
+        found = grow_tree(push_model, state, *arguments, **options)
+        # Nothing is where the plan expects it: the next decision plans anew.
+        return replace(found, states=found.states + 1.0)
+
+    monkeypatch.setattr(PLAN, plan)
+    status = rhp("plan", "--checked", "--no-realtime", "--out", "out")
+    assert status == (1 if exception is None else 130)
+    assert len(searches) == 2
+    first, second = shown_from
+    assert second > first + 0.5
+
+
 def test_no_plan(rhp, tmp_path, capsys):
     assert rhp("plan", "--no-meshcat", "--time-limit", "1e-9", "--out", "out") == 1
     assert "no plan" in capsys.readouterr().out
@@ -114,6 +150,31 @@ def test_ctrl_c_in_the_search(rhp, tmp_path, monkeypatch, capsys):
     assert "There is no plan: the search did not come to its end." in printed
     assert "Interrupted: stopped by the user." in printed
     assert names(tmp_path / "out") == []
+
+
+def test_no_search_began(rhp, capsys):
+    # Before anything is measured to be at rest.
+    options = ("--no-meshcat", "--scenario-text", "{time_limit: 1.0e-3}")
+    assert rhp("plan", *options, "--out", "out") == 1
+    printed = capsys.readouterr().out
+    assert "There is no plan: no search began." in printed
+    assert "Time limit: not done after 0.001 simulated seconds." in printed
+
+
+@pytest.mark.parametrize(
+    ("flag", "kind", "limit"),
+    [
+        ("--open-loop", "OpenLoopConfig", 30.0),
+        ("--checked", "CheckedPlanConfig", 30.0),
+        ("--checked", "OpenLoopConfig", 120.0),
+    ],
+)
+def test_default_limit_of_time(flag, kind, limit, rhp, tmp_path):
+    text = f"{{policy: !{kind} {{time_limit: 30.0}}}}"
+    options = ("--no-meshcat", "--no-execute", "--scenario-text", text)
+    assert rhp("plan", flag, *options, "--out", "out") == 0
+    policy = read(tmp_path / "out" / "plan.json")["scenario"]["policy"]
+    assert policy["time_limit"] == limit
 
 
 @pytest.mark.parametrize(

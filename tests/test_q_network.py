@@ -82,7 +82,7 @@ def message_of(path, num_objects=3) -> str:
 def test_bad_files(path, tmp_path):
     assert "no such file" in message_of(tmp_path / "missing.safetensors")
     assert "not a readable file" in message_of(tmp_path)
-    assert "for 3 objects, the scenario has 2" in message_of(path, num_objects=2)
+    assert "the weights are for 3 objects, not 2." in message_of(path, num_objects=2)
     data = path.read_bytes()
     for broken in (b"", b"not weights", data[: len(data) // 2]):
         path.write_bytes(broken)

@@ -11,7 +11,6 @@ neither discrete controls nor directed samplers of one's own.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 import math
 import time
 from typing import Any, Final
@@ -20,6 +19,7 @@ import numpy as np
 import ompl
 
 from rhp_drake.benchmarks.ompl_problem import NO_NODE, Problem
+from rhp_drake.benchmarks.planners import Found
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
@@ -45,21 +45,6 @@ _GOAL_BIAS: Final = 0.1
 # m, in the distance above, where an action of the hand alone is 0.01 to 0.02.
 _SELECTION_RADIUS: Final = 0.02
 _PRUNING_RADIUS: Final = 0.004
-
-
-@dataclass(frozen=True)
-class OmplPlan:
-    """What OMPL found.
-
-    Attributes:
-        actions: Shape (L,); None if no plan was found within the limits.
-        num_transitions: Actions simulated.
-        seconds: Time it took.
-    """
-
-    actions: np.ndarray | None
-    num_transitions: int
-    seconds: float
 
 
 def _make_space(num_objects: int) -> Any:
@@ -191,7 +176,7 @@ def plan_with_ompl(
     *,
     time_limit: float = math.inf,
     max_transitions: int = 1_000_000,
-) -> OmplPlan:
+) -> Found:
     """Plans with one of `OMPL_PLANNERS`.
 
     The same generator gives the same search.  OMPL's own random numbers come from a
@@ -261,4 +246,7 @@ def plan_with_ompl(
         actions = HAND_ACTIONS[
             [path.getControl(i).value for i in range(path.getControlCount())]
         ]
-    return OmplPlan(actions, problem.num_transitions, time.perf_counter() - begin)
+    seconds = time.perf_counter() - begin
+    # Both planners stop at their first plan.
+    first_seconds = math.nan if actions is None else seconds
+    return Found(actions, problem.num_transitions, seconds, first_seconds)

@@ -5,6 +5,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from rhp_drake.planning.search import hopeless
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.task import (
     GOAL_RADIUS,
@@ -15,11 +16,8 @@ from rhp_drake.task import (
     TaskInstance,
     allowed_actions,
     object_positions,
-    objects_fallen,
 )
 
-# m: an obstacle this far out of its region is as good as lost, as for our own planner.
-_OBSTACLE_LIMIT: Final = 1.5 * GOAL_RADIUS
 # The node number of states that are no node: samples, and what must not be reached.
 NO_NODE: Final = -1
 
@@ -118,10 +116,7 @@ class Problem:
             np.repeat(state[None], len(controls), axis=0), HAND_ACTIONS[controls]
         )
         self.num_transitions += len(controls)
-        moved = object_positions(results)[:, 1:] - self.task.goals[1:]
-        lost = (np.linalg.norm(moved, axis=-1) > _OBSTACLE_LIMIT).any(axis=1)
-        lost |= objects_fallen(results)
-        for i in np.flatnonzero(~lost):
+        for i in np.flatnonzero(~hopeless(results, self.task.goals)):
             children[int(controls[i])] = len(self._states)
             self._add(results[i], depth)
         return children

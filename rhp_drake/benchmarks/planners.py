@@ -14,6 +14,7 @@ from rhp_drake.planning.best_first import plan_best_first
 from rhp_drake.planning.kinodynamic_rrt import IMPROVEMENT, plan
 from rhp_drake.planning.policy_config import DEFAULT_Q_NETWORK
 from rhp_drake.planning.receding_horizon import ValueFunction
+from rhp_drake.planning.search import Plan
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.resources import resolve
@@ -29,12 +30,15 @@ class Found:
     Attributes:
         actions: The plan, shape (L,); None if there is none.
         num_transitions: Actions simulated.
-        seconds: Time it took.
+        seconds: Time of the whole search.
+        first_seconds: When the first plan was found, s after the search began; nan
+            without one.
     """
 
     actions: np.ndarray | None
     num_transitions: int
     seconds: float
+    first_seconds: float
 
 
 def _rrt(
@@ -53,7 +57,7 @@ def _rrt(
         improvement=improvement,
         time_limit=time_limit,
     )
-    return Found(found.actions, len(found.search.actions), found.seconds)
+    return _found(found)
 
 
 @lru_cache(maxsize=1)
@@ -75,7 +79,13 @@ def _best_first(
         max_transitions=1_000_000,
         time_limit=time_limit,
     )
-    return Found(found.actions, len(found.search.actions), found.seconds)
+    return _found(found)
+
+
+def _found(found: Plan) -> Found:
+    return Found(
+        found.actions, len(found.search.actions), found.seconds, found.first_seconds
+    )
 
 
 def _ompl(
@@ -88,8 +98,7 @@ def _ompl(
 ) -> Found:
     from rhp_drake.benchmarks.ompl_planners import plan_with_ompl
 
-    found = plan_with_ompl(name, push_model, task, generator, time_limit=time_limit)
-    return Found(found.actions, found.num_transitions, found.seconds)
+    return plan_with_ompl(name, push_model, task, generator, time_limit=time_limit)
 
 
 Planner = Callable[[PushModel, TaskInstance, np.random.Generator, float], Found]
@@ -125,14 +134,17 @@ class PlannerResult:
     """What came of it.
 
     Attributes:
-        solved: Whether there is a plan in time that leads to the goal when replayed.
-        seconds: Time of the search.
+        solved: Whether a plan was found in time, and the last one leads to the goal
+            when replayed.
+        seconds: Time of the whole search.
+        first_seconds: When the first plan was found, s; nan without one.
         num_transitions: Actions simulated.
         num_actions: Of the plan; 0 without one.
     """
 
     solved: bool
     seconds: float
+    first_seconds: float
     num_transitions: int
     num_actions: int
 
@@ -150,7 +162,8 @@ def check_planners(names: Sequence[str]) -> None:
             )
         if name.startswith("ompl_") and not find_spec("ompl"):
             raise InputError(
-                f"--planners: {name} needs OMPL: pip install 'rhp_drake[bench]'."
+                f"--planners: {name} needs OMPL: "
+                'pip install -c constraints.txt -e ".[bench]".'
             )
 
 
@@ -192,11 +205,14 @@ def _run(trial: PlannerTrial, time_limit: float, seed: int) -> PlannerResult:
     found = PLANNERS[trial.planner](_push_model(), task, generator, time_limit)
     solved = (
         found.actions is not None
-        and found.seconds <= time_limit
+        # A search that goes on for a shorter plan may end just after the limit.
+        and found.first_seconds <= time_limit
         and leads_to_goal(_push_model(), task, found.actions)
     )
     num_actions = 0 if found.actions is None else len(found.actions)
-    return PlannerResult(solved, found.seconds, found.num_transitions, num_actions)
+    return PlannerResult(
+        solved, found.seconds, found.first_seconds, found.num_transitions, num_actions
+    )
 
 
 def leads_to_goal(

@@ -41,7 +41,8 @@ def push_model(
 ) -> None:
     """Measures accuracy and speed of the push model, and how much they matter.
 
-    Box2D and MuJoCo are compared if they are installed: pip install 'rhp_drake[bench]'.
+    Box2D and MuJoCo, which come with the extra "bench" of this project, are
+    compared if they are installed.
     """
     from rich.console import Console
 

@@ -44,13 +44,19 @@ def evaluate(
     from rich.console import Console
     from rich.progress import track
 
-    from rhp_drake.evaluation.comparison import Comparison, make_table, run_comparison
+    from rhp_drake.evaluation.comparison import (
+        Comparison,
+        make_failure_table,
+        make_table,
+        run_comparison,
+    )
     from rhp_drake.evaluation.machine import describe_machine
     from rhp_drake.files import check_writable
 
     comparison = Comparison(
         {name: _config(name, weights, temperature) for name in policies.split(",")},
-        levels.split(","),
+        # A level named twice would count each of its episodes twice.
+        list(dict.fromkeys(levels.split(","))),
         instances,
         count,
         world,
@@ -71,7 +77,14 @@ def evaluate(
         ),
     )
     title = f"{world} world, first {count} instances of the {instances} set"
-    console.print(make_table(results, title))
+    if len(comparison.levels) == 1:
+        title += f", uncertainty: {comparison.levels[0]}"
+    tables = [make_table(results, title)]
+    if not all(episode.succeeded for _, episode in results):
+        tables.append(make_failure_table(results))
+    for table in tables:
+        console.print(table)
+        console.print()
     console.print(describe_machine(workers))
     if out is not None:
         _write(out, results)

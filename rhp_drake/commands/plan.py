@@ -39,7 +39,11 @@ def plan(
         typer.Option(help="YAML to merge into it, e.g. '{world_physics: high}'."),
     ] = None,
     time_limit: Annotated[
-        float | None, typer.Option(help="Of a search, s; by default the scenario's.")
+        float | None,
+        typer.Option(
+            help="Of each search, s; by default what the scenario's policy says if "
+            "it is of this kind, else 120."
+        ),
     ] = None,
     checked: Annotated[
         bool,
@@ -60,9 +64,9 @@ def plan(
 ) -> None:
     """Plans one task with the kinodynamic RRT, and executes the plan.
 
-    Writes plan.json, run.json unless the plan is not executed, and, with Meshcat,
-    recording.html.  The exit status is 0 if a plan was found and, executed, succeeded;
-    1 if not, 2 for bad input, 130 after Ctrl-C.
+    Writes plan.json; run.json, if the plan is to be executed; and recording.html,
+    with Meshcat.  The exit status is 0 if the plan succeeded or, with
+    --no-execute, was found; 1 if not, 2 for bad input, 130 after Ctrl-C.
     """
     from rhp_drake.scenario import load_scenario
 
@@ -109,9 +113,9 @@ def _plan(
 
     def on_decision(record: "DecisionRecord") -> None:
         nonlocal shown
-        if planner.num_searches == shown:
+        if planner.num_begun == shown:
             return
-        shown = planner.num_searches
+        shown = planner.num_begun
         if drawing is not None:
             drawing.show_from(record.time)
         # Reality need not be caught up with after a long search.
@@ -126,10 +130,15 @@ def _plan(
             run = task_run.run_task(simulator, scenario, console, on_decision)
         except _NotExecutedError:
             run = None
+        # No decision has shown a search that failed or was interrupted.
+        if drawing is not None and planner.num_begun > shown:
+            drawing.show_from(simulator.get_context().get_time())
     if run is None:
         console.print(f"Results: {folder}")
         return 0
-    if planner.num_searches == 0:
+    if planner.num_begun == 0:
+        console.print("There is no plan: no search began.")
+    elif planner.num_ended == 0:
         console.print("There is no plan: the search did not come to its end.")
     if execute:
         task_run.write_run(run, scenario, folder)
@@ -150,14 +159,16 @@ class _ShownPlanner:
         console: Where to say how the search comes on.
         drawing: Where to draw the tree, None for nowhere.
         folder: Of plan.json.
-        num_searches: How many came to an end.
+        num_begun: How many searches began.
+        num_ended: How many came to an end.
     """
 
     scenario: "Scenario"
     console: "Console"
     drawing: "TreeDrawing | None"
     folder: Path
-    num_searches: int = 0
+    num_begun: int = 0
+    num_ended: int = 0
 
     def __call__(
         self,
@@ -173,6 +184,7 @@ class _ShownPlanner:
 
         growth: Growth | None = None
         begin = time.perf_counter()
+        self.num_begun += 1
         if self.drawing is not None:
             self.drawing.begin_search()
 
@@ -198,13 +210,13 @@ class _ShownPlanner:
             self.drawing.draw()
         if growth is not None:
             self.console.print(_progress(growth, found.seconds))
-        if self.num_searches == 0:
+        if self.num_ended == 0:
             self._write(found, goals, growth)
             if found.actions is not None:
                 self.console.print(_make_table(found.actions, found.states, goals))
         elif found.actions is not None:
             self.console.print(f"A new plan of {len(found.actions)} actions.")
-        self.num_searches += 1
+        self.num_ended += 1
         return found
 
     def _write(

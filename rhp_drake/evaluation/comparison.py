@@ -139,47 +139,96 @@ def run_comparison(
     )
 
 
-def make_table(results: Sequence[tuple[Trial, Episode]], title: str) -> Table:
-    """A table of success, causes of failure, and cost, a row a policy and level.
+_Results: TypeAlias = Sequence[tuple[Trial, Episode]]
+
+
+def make_table(results: _Results, title: str) -> Table:
+    """A table of success and cost, a row a policy and level.
 
     Beside the success stands what the paper's imitation columns say of the policy.
-    Actions and computation are means over the runs that succeeded; the last number is
-    simulated time over the world's own computation.
+    Actions and computation are means over the runs that succeeded; the last number,
+    where time flows, is simulated time over the world's own computation.
     """
-    # Without frames, it fits into 80 columns.
-    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("\npolicy", no_wrap=True)
-    table.add_column("uncer-\ntainty", no_wrap=True)
-    table.add_column("success %\n(95 % Wilson)", justify="right", no_wrap=True)
-    table.add_column("paper\n%", justify="right", no_wrap=True)
-    table.add_column("\nactions", justify="right", no_wrap=True)
-    table.add_column("ms a decision\np50 / p95", justify="right", no_wrap=True)
-    table.add_column("thinks\ns a run", justify="right", no_wrap=True)
-    table.add_column("x real\ntime", justify="right", no_wrap=True)
-    table.add_column("\nfailures")
-    rows: dict[tuple[str, str], list[Episode]] = {}
-    for trial, episode in results:
-        rows.setdefault((trial.policy, trial.level), []).append(episode)
-    for (policy, level), episodes in rows.items():
+    time_flows = any(episode.simulated_seconds for _, episode in results)
+    headings = [
+        "success %\n(95 % Wilson)",
+        "paper\n%",
+        "\nactions",
+        "ms a decision\np50 / p95",
+        "thinks\ns a run",
+        *(["x real\ntime"] if time_flows else []),
+    ]
+
+    def cells(policy: str, level: str, episodes: Sequence[Episode]) -> list[str]:
         successes = [episode for episode in episodes if episode.succeeded]
         seconds = [s for episode in episodes for s in episode.decision_seconds]
         # A policy that fails at once has made no decision.
         p50, p95 = 1e3 * np.percentile(seconds or [np.nan], [50, 95])
-        simulated = sum(e.simulated_seconds for e in episodes)
-        factor = simulated / sum(e.world_seconds for e in episodes) if simulated else 0
-        causes = [episode.outcome for episode in episodes if not episode.succeeded]
-        table.add_row(
-            policy,
-            level,
+        row = [
             format_rate(len(successes), len(episodes)),
             str(_PAPER_SUCCESS.get(policy, {}).get(level, "")),
             f"{_mean([e.num_actions for e in successes]):.1f}",
-            f"{p50:.1f} / {p95:.1f}",
+            f"{_format_ms(p50)} / {_format_ms(p95)}",
             f"{_mean([sum(e.decision_seconds) for e in successes]):.2f}",
-            f"{factor:.1f}" if simulated else "-",
-            ", ".join(f"{causes.count(c)} {c}" for c in dict.fromkeys(causes)),
-        )
+        ]
+        if time_flows:
+            simulated = sum(e.simulated_seconds for e in episodes)
+            row.append(f"{simulated / sum(e.world_seconds for e in episodes):.1f}")
+        return row
+
+    return _table_by_policy(results, title, headings, cells)
+
+
+def make_failure_table(results: _Results) -> Table:
+    """How often the runs failed by each cause, a row a policy and level."""
+    causes = dict.fromkeys(e.outcome for _, e in results if not e.succeeded)
+
+    def cells(policy: str, level: str, episodes: Sequence[Episode]) -> list[str]:
+        outcomes = [episode.outcome for episode in episodes]
+        return [str(outcomes.count(cause) or "") for cause in causes]
+
+    # A line a word: the station has many causes.
+    headings = [cause.replace(" ", "\n") for cause in causes]
+    return _table_by_policy(results, "Failures", headings, cells)
+
+
+def _table_by_policy(
+    results: _Results,
+    title: str,
+    headings: Sequence[str],
+    cells: Callable[[str, str, Sequence[Episode]], list[str]],
+) -> Table:
+    """A table of what `cells` says of each policy's and level's episodes.
+
+    Levels have a column if there are several.
+    """
+    # Without frames, it fits into 80 columns.
+    table = Table(
+        title=title,
+        box=SIMPLE_HEAD,
+        padding=0,
+        show_edge=False,
+    )
+    several = len({trial.level for trial, _ in results}) > 1
+    for heading in ("policy", "level") if several else ("policy",):
+        table.add_column(heading, no_wrap=True, vertical="bottom")
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
+    rows: dict[str, dict[str, list[Episode]]] = {}
+    for trial, episode in results:
+        rows.setdefault(trial.policy, {}).setdefault(trial.level, []).append(episode)
+    for policy, by_level in rows.items():
+        name = policy
+        for level, episodes in by_level.items():
+            labels = (name, level) if several else (name,)
+            table.add_row(*labels, *cells(policy, level, episodes))
+            # Once is enough.
+            name = ""
     return table
+
+
+def _format_ms(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}"
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -145,9 +145,9 @@ class RecedingHorizonDemonstrator:
         seconds = time.perf_counter() - begin
         search = self._recorder.search()
         if goals_reached(state, goals):
-            found = Plan(np.array(actions), np.array(states), search, seconds)
+            found = Plan(np.array(actions), np.array(states), search, seconds, seconds)
         else:
-            found = Plan(None, instance.initial_state[None], search, seconds)
+            found = Plan(None, instance.initial_state[None], search, seconds, np.nan)
         return _demonstration(self.seed, task, instance, found)
 
 

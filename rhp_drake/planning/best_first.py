@@ -8,6 +8,7 @@ planning).  It needs no random draws.
 """
 
 import heapq
+import math
 import time
 from typing import Final, NamedTuple
 
@@ -82,8 +83,8 @@ def plan_best_first(
             _propose(queue, value_function, nodes, new, goals)
     seconds = time.perf_counter() - begin
     if goal is None:
-        return Plan(None, state[None], record.search(), seconds)
-    return Plan(*nodes.path(goal), record.search(), seconds)
+        return Plan(None, state[None], record.search(), seconds, math.nan)
+    return Plan(*nodes.path(goal), record.search(), seconds, seconds)
 
 
 class _Edge(NamedTuple):

@@ -194,6 +194,7 @@ def plan(
     record = SearchRecord(len(state))
     best = (np.empty(0, int), state[None]) if goals_reached(state, goals) else None
     length_to_beat = None
+    first_seconds = math.nan if best is None else 0.0
     restart_at, stop_at = _RESTART, max_transitions if best is None else 0
     num_trees, nearest = 1, _nearest(state[None], goals)
     while record.num_transitions < stop_at:
@@ -224,6 +225,7 @@ def plan(
         found = _grow(tree, node, actions, children, indices)
         if found is not None:
             if best is None:
+                first_seconds = time.perf_counter() - begin
                 stop_at = min(stop_at, record.num_transitions + improvement)
             best, length_to_beat = found, len(found[0])
         if on_growth is not None:
@@ -249,8 +251,8 @@ def plan(
         num_trees += 1
     seconds = time.perf_counter() - begin
     if best is None:
-        return Plan(None, state[None], record.search(), seconds)
-    return Plan(*best, record.search(), seconds)
+        return Plan(None, state[None], record.search(), seconds, first_seconds)
+    return Plan(*best, record.search(), seconds, first_seconds)
 
 
 def _nearest(states: np.ndarray, goals: np.ndarray) -> float:

@@ -40,13 +40,16 @@ class Plan:
         actions: Shape (L,); None if no plan was found within the limits.
         states: s_0 ... s_L, shape (L + 1, 3 + 3 m); s_0 alone without a plan.
         search: All that was simulated, the children that were dropped included.
-        seconds: Time it took.
+        seconds: Time of the whole search.
+        first_seconds: When the first plan was found, s after the search began; nan
+            without one.
     """
 
     actions: np.ndarray | None
     states: np.ndarray
     search: Search
     seconds: float
+    first_seconds: float
 
 
 @dataclass(frozen=True)

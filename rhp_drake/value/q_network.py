@@ -93,8 +93,8 @@ def load_q_network(path: Path, num_objects: int) -> QNetwork:
         raise InputError(f"{path}: not the weights of a Q-network of this version.")
     if metadata.get("num_objects") != str(num_objects):
         raise InputError(
-            f"{path}: the weights are for {metadata.get('num_objects')} objects, the "
-            f"scenario has {num_objects}."
+            f"{path}: the weights are for {metadata.get('num_objects')} objects, not "
+            f"{num_objects}."
         )
     network = QNetwork(num_objects)
     try:
