@@ -127,7 +127,7 @@ def _run_on_cluster(
         import ray
     except ImportError:
         raise InputError(
-            'a cluster needs Ray: pip install -e ".[distributed]".'
+            'a cluster needs Ray: pip install -c constraints.txt -e ".[distributed]".'
         ) from None
     try:
         ray.init(
