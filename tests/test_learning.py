@@ -18,6 +18,7 @@ from rhp_drake.learning.imitation import (
     imitation_targets,
     return_of,
 )
+from rhp_drake.learning.reinforcement import Reinforcement, Rounds
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
@@ -175,3 +176,41 @@ def test_training_goes_on_from_a_checkpoint_as_if_never_stopped(
         other.resume(tmp_path / "checkpoint", {"seed": 3})
     with pytest.raises(InputError, match="other work"):
         resumed.resume(tmp_path / "checkpoint", {"seed": 4})
+
+
+def test_reinforcement_goes_on_as_if_never_stopped(data, tmp_path):
+    config = FittedQConfig(num_steps=6, batch_size=64)
+    rounds = Rounds(num_tasks=2, num_steps=3)
+
+    def learn(folder, stops_at=None):
+        torch.manual_seed(0)
+        learner = FittedQ(QNetwork(3), [data], config, stream(3))
+        checkpoint = tmp_path / "checkpoint"
+        if stops_at is None and folder.exists():
+            learner.resume(checkpoint, {})
+        reinforcement = Reinforcement(learner, rounds, folder, 3, 1, "commit")
+        while learner.num_steps < config.num_steps:
+            for done in reinforcement.act():
+                if stops_at == (learner.num_steps, done):
+                    return learner
+            learner.step()
+            learner.save(checkpoint, {})
+            if stops_at == learner.num_steps:
+                return learner
+        assert len(learner.sources[1].goals) == 4
+        return learner
+
+    straight = learn(tmp_path / "straight")
+    for name, stop in (("learning", 4), ("acting", (3, 1))):
+        learn(tmp_path / name, stop)
+        resumed = learn(tmp_path / name)
+        for ours, theirs in zip(
+            straight.network.parameters(), resumed.network.parameters(), strict=True
+        ):
+            torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+
+
+def test_rounds_must_fit(data, tmp_path):
+    learner = FittedQ(QNetwork(3), [data], FittedQConfig(num_steps=5), stream(3))
+    with pytest.raises(InputError, match="5 steps are no whole number of rounds of 3"):
+        Reinforcement(learner, Rounds(num_steps=3), tmp_path, 3, 1, "commit")

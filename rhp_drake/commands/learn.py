@@ -1,19 +1,25 @@
-"""`rhp imitate` and `rhp fit`: from demonstrations to a Q-network."""
+"""`rhp imitate`, `rhp fit` and `rhp reinforce`: from demonstrations to a Q-network."""
 
+from dataclasses import asdict
 import hashlib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rhp_drake.commands.training import prepare, train
 from rhp_drake.errors import InputError
 
+# torch and Drake are imported in the functions, so that `rhp --help` is quick.
+if TYPE_CHECKING:
+    from rhp_drake.value.q_network import QNetwork
+
 _Demos = Annotated[
     list[Path],
     typer.Option(help="File or folder of demonstrations; may be repeated."),
 ]
 _Out = Annotated[Path, typer.Option(help="File of the trained weights.")]
+_Start = Annotated[Path, typer.Option(help="Weights to start from.")]
 _Seed = Annotated[int, typer.Option(min=0, help="Of all random draws.")]
 _Steps = Annotated[int, typer.Option(min=1, help="Gradient steps.")]
 
@@ -43,10 +49,56 @@ def imitate(
     train(learner, out, demonstrations, {"seed": seed}, Console())
 
 
+def reinforce(
+    *,
+    demonstrations: _Demos,
+    start: _Start,
+    out: _Out,
+    seed: _Seed = 0,
+    steps: _Steps = 40_000,
+    workers: Annotated[
+        int, typer.Option(min=1, help="How many processes act on this machine.")
+    ] = 2,
+) -> None:
+    """Improves a Q-network by RHP-guided reinforcement learning (section V).
+
+    You may stop this at any moment: the same command goes on where it was, from files
+    beside the weights.
+    """
+    from rich.console import Console
+
+    from rhp_drake.learning.demonstrations import load_demonstrations
+    from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
+    from rhp_drake.learning.reinforcement import Reinforcement, Rounds
+    from rhp_drake.random_streams import stream
+    from rhp_drake.run_record import source_commit
+    from rhp_drake.value.q_network import load_q_network
+
+    prepare(out, seed)
+    data = load_demonstrations(demonstrations)
+    if not len(data.search_actions):
+        raise InputError("none of the demonstrations holds a search to learn from.")
+    network = load_q_network(start, data.goals.shape[1])
+    rounds = Rounds()
+    learner = FittedQ(
+        network, [data], FittedQConfig(num_steps=steps), stream(seed, "reinforcement")
+    )
+    reinforcement = Reinforcement(
+        learner,
+        rounds,
+        out.with_name(out.name + ".rounds"),
+        seed,
+        workers,
+        source_commit(),
+    )
+    origin = _origin(seed, start, network) | {"rounds": asdict(rounds)}
+    train(learner, out, demonstrations, origin, Console(), reinforcement)
+
+
 def fit(
     *,
     demonstrations: _Demos,
-    start: Annotated[Path, typer.Option(help="Weights to start from.")],
+    start: _Start,
     out: _Out,
     seed: _Seed = 0,
     steps: _Steps = 40_000,
@@ -71,9 +123,14 @@ def fit(
     network = load_q_network(start, sources[0].goals.shape[1])
     config = FittedQConfig(num_steps=steps)
     learner = FittedQ(network, sources, config, stream(seed, "fitted_q"))
-    origin = {
+    origin = _origin(seed, start, network)
+    train(learner, out, demonstrations, origin, Console())
+
+
+def _origin(seed: int, start: Path, network: "QNetwork") -> dict[str, Any]:
+    """What a result depends on beside data and settings."""
+    return {
         "seed": seed,
         "start": hashlib.sha256(start.read_bytes()).hexdigest(),
         "start_provenance": network.provenance,
     }
-    train(learner, out, demonstrations, origin, Console())

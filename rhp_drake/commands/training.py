@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from rhp_drake.learning.learner import Learner
+    from rhp_drake.learning.reinforcement import Reinforcement
     from rhp_drake.value.q_network import QNetwork
 
 VALIDATION_TASKS: Final = 200
@@ -39,6 +40,7 @@ def train(
     sources: list[Path],
     origin: dict[str, Any],
     console: "Console",
+    reinforcement: "Reinforcement | None" = None,
 ) -> None:
     """Trains to the end, from a checkpoint if there is one, and writes the weights.
 
@@ -51,6 +53,7 @@ def train(
         sources: Where the data come from.
         origin: What else the result depends on, for checkpoint and provenance.
         console: Where to say things.
+        reinforcement: Makes experience on the way.
     """
     from torch.utils.tensorboard import SummaryWriter
 
@@ -71,7 +74,12 @@ def train(
         make_progress(console) as progress,
     ):
         bar = progress.add_task("Steps", total=total, completed=learner.num_steps)
+        acting = progress.add_task("Tasks", visible=False)
         while learner.num_steps < total:
+            if reinforcement is not None:
+                for done in reinforcement.act():
+                    tasks = reinforcement.rounds.num_tasks
+                    progress.update(acting, completed=done, total=tasks, visible=True)
             learner.step()
             step = learner.num_steps
             if step % _LOG_PERIOD == 0:
