@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from rhp_drake.errors import InputError
+from rhp_drake.errors import InputError, WorkError
 from rhp_drake.learning.augmentation import Symmetry
 from rhp_drake.learning.demonstration_folder import demonstrate_tasks
 from rhp_drake.learning.demonstrations import load_demonstrations
 from rhp_drake.learning.demonstrators import PlanningDemonstrator
 from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, double_q_targets, sample
 from rhp_drake.learning.imitation import (
+    Imitation,
     ImitationConfig,
-    imitate,
     imitation_targets,
     return_of,
 )
+from rhp_drake.learning.reinforcement import Reinforcement, Rounds
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
@@ -56,9 +57,26 @@ def test_eq_3_grounds_only_what_looks_better_than_the_plan():
 
 def test_imitation_learns_the_plans(data):
     torch.manual_seed(0)
+    config = ImitationConfig(num_steps=60)
+    learner = Imitation(QNetwork(3), data, config, stream(0))
+    learner.step()
+    first = learner.mean_loss
+    for _ in range(59):
+        learner.step()
+    learner.step()
+    assert learner.mean_loss < 0.7 * first
+
+
+def test_a_loss_that_is_not_finite_stops_training(data):
+    torch.manual_seed(0)
     network = QNetwork(3)
-    losses = list(imitate(network, data, ImitationConfig(num_epochs=60), stream(0)))
-    assert losses[-1] < 0.5 * losses[0]
+    learner = Imitation(network, data, ImitationConfig(), stream(0))
+    learner.step()
+    with torch.no_grad():
+        network.layers[0].weight[0, 0] = torch.nan
+    with pytest.raises(WorkError, match="the loss of step 1 is nan"):
+        learner.step()
+    assert learner.num_steps == 1
 
 
 def test_double_q_targets_by_hand():
@@ -79,7 +97,7 @@ def test_double_q_targets_by_hand():
 
 def test_hindsight_goals_are_reached_in_time(data):
     """Following the search from a sample to its end meets the goals it was given."""
-    samples = sample(data, 4000, stream(1))
+    samples = sample([data], 4000, stream(1))
     known = np.isfinite(samples.least_returns)
     assert known.mean() > 0.05
     # One action is enough where the least return says so.
@@ -116,13 +134,21 @@ def test_symmetries_are_those_of_the_task(data):
     np.testing.assert_allclose(np.sort(seen_ways[:, 1:]), np.sort(ways[:, 1:]))
 
 
-def test_fitting_goes_on_from_a_checkpoint_as_if_never_stopped(data, tmp_path):
-    config = FittedQConfig(num_steps=8, batch_size=64)
+LEARNERS = [
+    (FittedQ, FittedQConfig(num_steps=8, batch_size=64)),
+    (Imitation, ImitationConfig(num_steps=8, batch_size=64)),
+]
 
+
+@pytest.mark.parametrize(("kind", "config"), LEARNERS, ids=["fitted_q", "imitation"])
+def test_training_goes_on_from_a_checkpoint_as_if_never_stopped(
+    kind, config, data, tmp_path
+):
     def learner():
         torch.manual_seed(0)
         network = QNetwork(3)
-        return network, FittedQ(network, data, config, stream(3))
+        source = [data] if kind is FittedQ else data
+        return network, kind(network, source, config, stream(3))
 
     network, straight = learner()
     for _ in range(8):
@@ -144,8 +170,47 @@ def test_fitting_goes_on_from_a_checkpoint_as_if_never_stopped(data, tmp_path):
     (tmp_path / "corrupt").write_bytes(b"no checkpoint")
     with pytest.raises(InputError, match="corrupt"):
         resumed.resume(tmp_path / "corrupt", {"seed": 3})
-    other = FittedQ(network, data, replace(config, discount=0.9), stream(3))
+    source = [data] if kind is FittedQ else data
+    other = kind(network, source, replace(config, discount=0.9), stream(3))
     with pytest.raises(InputError, match="other work"):
         other.resume(tmp_path / "checkpoint", {"seed": 3})
     with pytest.raises(InputError, match="other work"):
         resumed.resume(tmp_path / "checkpoint", {"seed": 4})
+
+
+def test_reinforcement_goes_on_as_if_never_stopped(data, tmp_path):
+    config = FittedQConfig(num_steps=6, batch_size=64)
+    rounds = Rounds(num_tasks=2, num_steps=3)
+
+    def learn(folder, stops_at=None):
+        torch.manual_seed(0)
+        learner = FittedQ(QNetwork(3), [data], config, stream(3))
+        checkpoint = tmp_path / "checkpoint"
+        if stops_at is None and folder.exists():
+            learner.resume(checkpoint, {})
+        reinforcement = Reinforcement(learner, rounds, folder, 3, 1, "commit")
+        while learner.num_steps < config.num_steps:
+            for done in reinforcement.act():
+                if stops_at == (learner.num_steps, done):
+                    return learner
+            learner.step()
+            learner.save(checkpoint, {})
+            if stops_at == learner.num_steps:
+                return learner
+        assert len(learner.sources[1].goals) == 4
+        return learner
+
+    straight = learn(tmp_path / "straight")
+    for name, stop in (("learning", 4), ("acting", (3, 1))):
+        learn(tmp_path / name, stop)
+        resumed = learn(tmp_path / name)
+        for ours, theirs in zip(
+            straight.network.parameters(), resumed.network.parameters(), strict=True
+        ):
+            torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+
+
+def test_rounds_must_fit(data, tmp_path):
+    learner = FittedQ(QNetwork(3), [data], FittedQConfig(num_steps=5), stream(3))
+    with pytest.raises(InputError, match="5 steps are no whole number of rounds of 3"):
+        Reinforcement(learner, Rounds(num_steps=3), tmp_path, 3, 1, "commit")

@@ -105,6 +105,7 @@ def _demonstrate(task: int, demonstrator: Demonstrator) -> Demonstration:
     try:
         key = repr(demonstrator)
         if key not in _residents:
+            _residents.clear()
             # A copy: with a push model, the original could not be sent any more.
             _residents[key] = copy(demonstrator)
         return _residents[key].demonstrate(task)
@@ -176,5 +177,9 @@ def shard_paths(paths: Sequence[Path]) -> list[Path]:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What a file, or the first one of a folder, says of itself: see `about`."""
-    return about(read_table(shard_paths([path])[0], ["task"]))
+    """What a file or the first one of a folder says of itself, and how many "tasks".
+
+    See `demonstration_files.about`.
+    """
+    tables = [read_table(shard, ["task"]) for shard in shard_paths([path])]
+    return about(tables[0]) | {"tasks": sum(table.num_rows for table in tables)}

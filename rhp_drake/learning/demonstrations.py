@@ -70,7 +70,7 @@ def load_demonstrations(paths: Sequence[Path]) -> Demonstrations:
     Raises:
         InputError: If a file cannot be read, or there is none.
     """
-    return _concatenate(
+    return concatenate(
         [_flatten(read_table(path, _COLUMNS)) for path in shard_paths(paths)]
     )
 
@@ -111,7 +111,12 @@ def _flatten(table: pa.Table) -> Demonstrations:
     )
 
 
-def _concatenate(parts: list[Demonstrations]) -> Demonstrations:
+def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
+    """All of them as one, in order.
+
+    Raises:
+        InputError: If they are of different numbers of objects.
+    """
     if len({part.goals.shape[1] for part in parts}) > 1:
         raise InputError("the demonstrations are of different numbers of objects.")
     arrays = {}

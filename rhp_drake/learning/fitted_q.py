@@ -9,20 +9,17 @@ that the goal can be reached in so many actions, a lower bound of the value (He 
 Q-learning (van Hasselt et al. 2016).
 """
 
-from dataclasses import dataclass
-import io
-import json
-from pathlib import Path
-import pickle
-from typing import Any, Final
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Final
 
 import numpy as np
 import torch
+from torch import nn
 
-from rhp_drake.errors import InputError
-from rhp_drake.files import write_atomically
 from rhp_drake.learning.augmentation import Symmetry
 from rhp_drake.learning.demonstrations import Demonstrations
+from rhp_drake.learning.learner import Learner
 from rhp_drake.task import (
     GOAL_RADIUS,
     MAX_ACTIONS,
@@ -48,10 +45,7 @@ class FittedQConfig:
 
     Attributes:
         discount: gamma.
-        l2: Weight of the L2 regularisation.
-        learning_rate: Of Adam at the start; it falls to 0 as a cosine.
-        batch_size: Transitions a step.
-        num_steps: Gradient steps.
+        l2: See `LearnerConfig`, as the next three.
         target_rate: How far the target network follows at each step.
     """
 
@@ -91,9 +85,25 @@ def _in_disc(centres: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 
 def sample(
+    sources: Sequence[Demonstrations], num_samples: int, generator: np.random.Generator
+) -> Samples:
+    """Draws transitions and their goals, as many from each source."""
+    shares = np.diff(np.arange(len(sources) + 1) * num_samples // len(sources))
+    parts = [
+        _sample(source, int(share), generator)
+        for source, share in zip(sources, shares, strict=True)
+    ]
+    return Samples(
+        **{
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(Samples)
+        }
+    )
+
+
+def _sample(
     data: Demonstrations, num_samples: int, generator: np.random.Generator
 ) -> Samples:
-    """Draws transitions and their goals."""
     num_hindsight = int(_HINDSIGHT * num_samples)
     rows = generator.integers(len(data.search_actions), size=num_samples)
     goals = data.goals[data.search_tasks[rows]]
@@ -159,46 +169,48 @@ def double_q_targets(
     return REWARD + discount * future
 
 
-class FittedQ:
-    """Trains a Q-network in place, step by step.
+class FittedQ(Learner):
+    """Trains a Q-network by double Q-learning.
 
     Args:
         network: Its weights are the start.
-        data: What was simulated.
+        sources: What was simulated; each has the same share of a batch, so that a few
+            roll-outs count beside many searches.
         config: How.
         generator: Draws the batches, their goals and symmetries.
 
     Attributes:
-        num_steps: Steps taken so far.
-        mean_loss: Running mean of the loss.
+        sources: The same; more may be added.
     """
 
     def __init__(
         self,
         network: QNetwork,
-        data: Demonstrations,
+        sources: Sequence[Demonstrations],
         config: FittedQConfig,
         generator: np.random.Generator,
     ) -> None:
-        self.num_steps = 0
-        self.mean_loss = 0.0
-        self._network = network
-        self._data = data
+        super().__init__(network, config, generator)
         self._config = config
-        self._generator = generator
+        self.sources = list(sources)
         self._target = QNetwork(network.num_objects)
         self._target.load_state_dict(network.state_dict())
-        self._optimizer = torch.optim.Adam(
-            network.parameters(), config.learning_rate, weight_decay=config.l2
-        )
-        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-            self._optimizer, config.num_steps
-        )
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return super()._modules() | {"target": self._target}
 
     def step(self) -> None:
-        """One gradient step on a random batch."""
-        config, network = self._config, self._network
-        batch = sample(self._data, config.batch_size, self._generator)
+        """One gradient step, which the target network follows; see `Learner`."""
+        super().step()
+        with torch.no_grad():
+            for ours, theirs in zip(
+                self._target.parameters(), self.network.parameters(), strict=True
+            ):
+                ours.lerp_(theirs, self._config.target_rate)
+
+    def _loss(self) -> torch.Tensor:
+        config, network = self._config, self.network
+        batch = sample(self.sources, config.batch_size, self._generator)
         reached = torch.from_numpy(goals_reached(batch.next_states, batch.goals))
         fallen = torch.from_numpy(objects_fallen(batch.next_states))
         allowed = torch.from_numpy(allowed_actions(batch.next_states))
@@ -223,62 +235,4 @@ class FittedQ:
             targets = torch.maximum(targets, least)
         q = network(states, goals).gather(1, actions[:, None])[:, 0]
         losses = torch.nn.functional.smooth_l1_loss(q, targets, reduction="none")
-        loss = (losses * asked).mean()
-        self._optimizer.zero_grad()
-        loss.backward()
-        self._optimizer.step()
-        self._schedule.step()
-        with torch.no_grad():
-            for ours, theirs in zip(
-                self._target.parameters(), network.parameters(), strict=True
-            ):
-                ours.lerp_(theirs, config.target_rate)
-        self.num_steps += 1
-        weight = max(1 / self.num_steps, 0.001)
-        self.mean_loss += weight * (loss.item() - self.mean_loss)
-
-    def save(self, path: Path, origin: dict[str, Any]) -> None:
-        """Writes a checkpoint: going on from it is as if never stopped.
-
-        Args:
-            path: The file.
-            origin: What else the work depends on: seed, data, first weights.
-        """
-        buffer = io.BytesIO()
-        torch.save(
-            {
-                "network": self._network.state_dict(),
-                "target": self._target.state_dict(),
-                "optimizer": self._optimizer.state_dict(),
-                "schedule": self._schedule.state_dict(),
-                "generator": json.dumps(self._generator.bit_generator.state),
-                "num_steps": self.num_steps,
-                "mean_loss": self.mean_loss,
-                "config": vars(self._config),
-                "origin": json.dumps(origin),
-            },
-            buffer,
-        )
-        write_atomically(path, buffer.getvalue())
-
-    def resume(self, path: Path, origin: dict[str, Any]) -> None:
-        """Goes on from a checkpoint of `save`.
-
-        Raises:
-            InputError: If it cannot be read, or belongs to other work.
-        """
-        try:
-            saved = torch.load(path, weights_only=True)
-            same = saved["config"] == vars(self._config)
-            if not same or saved["origin"] != json.dumps(origin):
-                raise InputError(
-                    f"{path}: a checkpoint of other work; delete it to start anew."
-                )
-            self._network.load_state_dict(saved["network"])
-            self._target.load_state_dict(saved["target"])
-            self._optimizer.load_state_dict(saved["optimizer"])
-            self._schedule.load_state_dict(saved["schedule"])
-            self._generator.bit_generator.state = json.loads(saved["generator"])
-            self.num_steps, self.mean_loss = saved["num_steps"], saved["mean_loss"]
-        except (OSError, RuntimeError, KeyError, pickle.UnpicklingError) as error:
-            raise InputError(f"{path}: not a readable checkpoint ({error}).") from error
+        return (losses * asked).mean()

@@ -1,6 +1,5 @@
 """Imitation: the Q-network learns from plans (section IV-B of the paper)."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +7,7 @@ import torch
 
 from rhp_drake.learning.augmentation import Symmetry
 from rhp_drake.learning.demonstrations import Demonstrations
+from rhp_drake.learning.learner import Learner
 from rhp_drake.task import REWARD
 from rhp_drake.value.q_network import QNetwork
 
@@ -19,10 +19,7 @@ class ImitationConfig:
     Attributes:
         margin: k of Eq. 3, actions.
         discount: gamma.
-        l2: Weight of the L2 regularisation.
-        learning_rate: Of Adam at the start; it falls to 0 as a cosine.
-        batch_size: State-action pairs a step.
-        num_epochs: Passes over the pairs.
+        l2: See `LearnerConfig`, as the rest.
     """
 
     margin: int = 4
@@ -30,7 +27,7 @@ class ImitationConfig:
     l2: float = 1e-5
     learning_rate: float = 1e-3
     batch_size: int = 512
-    num_epochs: int = 150
+    num_steps: int = 40_000
 
 
 def return_of(actions_left: torch.Tensor, discount: float) -> torch.Tensor:
@@ -65,48 +62,45 @@ def imitation_targets(
     return targets.scatter(1, actions[:, None], chosen)
 
 
-def imitate(
-    network: QNetwork,
-    demonstrations: Demonstrations,
-    config: ImitationConfig,
-    generator: np.random.Generator,
-) -> Iterator[float]:
-    """Trains the network in place.
+class Imitation(Learner):
+    """Trains a Q-network by Eq. 2 and 3.
 
-    Yields:
-        The mean loss of each epoch.
+    Args:
+        network: Its weights are the start.
+        demonstrations: With at least one plan.
+        config: How.
+        generator: Draws the batches and their symmetries.
     """
-    states = torch.from_numpy(demonstrations.plan_states).float()
-    goals = torch.from_numpy(demonstrations.goals[demonstrations.plan_tasks]).float()
-    actions = torch.from_numpy(demonstrations.plan_actions).long()
-    actions_left = torch.from_numpy(demonstrations.plan_actions_left).float()
-    optimizer = torch.optim.Adam(
-        network.parameters(), config.learning_rate, weight_decay=config.l2
-    )
-    batches = -(-len(states) // config.batch_size)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-        optimizer, config.num_epochs * batches
-    )
-    network.train()
-    for _ in range(config.num_epochs):
-        order = torch.from_numpy(generator.permutation(len(states)))
-        total = 0.0
-        for batch in order.split(config.batch_size):
-            symmetry = Symmetry(len(batch), network.num_objects, generator)
-            q = network(symmetry.states(states[batch]), symmetry.goals(goals[batch]))
-            targets = imitation_targets(
-                q.detach(),
-                symmetry.actions(actions[batch]),
-                actions_left[batch],
-                config.margin,
-                config.discount,
-            )
-            # Summed over the actions, so that the chosen one weighs as in Eq. 2.
-            loss = (targets - q).square().sum(dim=1).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            total += loss.item()
-        yield total / batches
-    network.eval()
+
+    def __init__(
+        self,
+        network: QNetwork,
+        demonstrations: Demonstrations,
+        config: ImitationConfig,
+        generator: np.random.Generator,
+    ) -> None:
+        super().__init__(network, config, generator)
+        self._config = config
+        d = demonstrations
+        self._states = torch.from_numpy(d.plan_states).float()
+        self._goals = torch.from_numpy(d.goals[d.plan_tasks]).float()
+        self._actions = torch.from_numpy(d.plan_actions).long()
+        self._actions_left = torch.from_numpy(d.plan_actions_left).float()
+
+    def _loss(self) -> torch.Tensor:
+        config, size = self._config, self._config.batch_size
+        rows = self._generator.integers(len(self._states), size=size)
+        batch = torch.from_numpy(rows)
+        symmetry = Symmetry(size, self.network.num_objects, self._generator)
+        q = self.network(
+            symmetry.states(self._states[batch]), symmetry.goals(self._goals[batch])
+        )
+        targets = imitation_targets(
+            q.detach(),
+            symmetry.actions(self._actions[batch]),
+            self._actions_left[batch],
+            config.margin,
+            config.discount,
+        )
+        # Summed over the actions, so that the chosen one weighs as in Eq. 2.
+        return (targets - q).square().sum(dim=1).mean()

@@ -1,0 +1,124 @@
+"""RHP-guided reinforcement learning (section V of the paper), in rounds.
+
+In a round epsilon-RHP acts on fresh training tasks with the network as it is, and then
+the network learns from all rounds and the demonstrations.  So acting can be spread over
+processes, and a round's experience is a folder of demonstrations like any other: work
+that is stopped goes on where it was, with the same result.
+
+The paper's replay buffer holds what was executed.  This one holds all that RHP
+simulated to decide, which is twenty times as much and as true.
+"""
+
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from rhp_drake.errors import InputError
+from rhp_drake.learning.demonstration_folder import demonstrate_tasks
+from rhp_drake.learning.demonstrations import (
+    Demonstrations,
+    concatenate,
+    load_demonstrations,
+)
+from rhp_drake.learning.demonstrators import RecedingHorizonDemonstrator
+from rhp_drake.learning.fitted_q import FittedQ
+from rhp_drake.workers import Workers
+
+# Far from the tasks that demonstrations are made of.
+_FIRST_TASK: Final = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rounds:
+    """How acting and learning alternate.
+
+    Attributes:
+        num_tasks: On which RHP acts in a round.
+        num_steps: Gradient steps of a round.
+        epsilon: How often RHP's action is a random one.
+        temperature: tau of Eq. 5.
+    """
+
+    num_tasks: int = 100
+    num_steps: int = 1000
+    epsilon: float = 0.1
+    temperature: float = 0.5
+
+
+class Reinforcement:
+    """Feeds a learner with the experience that its own network makes.
+
+    Args:
+        learner: With the demonstrations as its one source.
+        rounds: How.
+        folder: Of the experience, a folder a round.
+        seed: Of tasks and policy.
+        workers: Who acts.
+        commit: Of the code, to be noted with the experience.
+
+    Attributes:
+        rounds: How.
+
+    Raises:
+        InputError: If the steps of a learner are no whole number of rounds.
+    """
+
+    def __init__(
+        self,
+        learner: FittedQ,
+        rounds: Rounds,
+        folder: Path,
+        seed: int,
+        workers: Workers,
+        commit: str,
+    ) -> None:
+        if learner.config.num_steps % rounds.num_steps:
+            raise InputError(
+                f"{learner.config.num_steps} steps are no whole number of rounds of "
+                f"{rounds.num_steps}."
+            )
+        self._learner = learner
+        self.rounds = rounds
+        self._folder = folder
+        self._seed = seed
+        self._workers = workers
+        self._commit = commit
+        self._experience: list[Demonstrations] = []
+
+    def act(self) -> Iterator[int]:
+        """Makes, or reads, the experience that the learner's next step needs.
+
+        Yields:
+            The number of tasks done in this round, if there is anything to do.
+        """
+        index, steps = divmod(self._learner.num_steps, self.rounds.num_steps)
+        if steps == 0:
+            yield from self._act(index)
+        for known in range(len(self._experience), index + 1):
+            self._experience.append(load_demonstrations([self._round(known)]))
+            self._learner.sources = [
+                self._learner.sources[0],
+                concatenate(self._experience),
+            ]
+
+    def _round(self, index: int) -> Path:
+        return self._folder / f"round_{index:04d}"
+
+    def _act(self, index: int) -> Iterator[int]:
+        first = _FIRST_TASK + index * self.rounds.num_tasks
+        demonstrator = RecedingHorizonDemonstrator(
+            self._seed,
+            # The network goes on learning.
+            deepcopy(self._learner.network),
+            self.rounds.epsilon,
+            self.rounds.temperature,
+        )
+        yield from demonstrate_tasks(
+            self._round(index),
+            range(first, first + self.rounds.num_tasks),
+            demonstrator,
+            self._workers,
+            self._commit,
+        )
