@@ -19,7 +19,7 @@ def push_model():
 
 @pytest.fixture(scope="module")
 def q_network():
-    return load_q_network(models_path() / "q_network/three_boxes.safetensors", 3)
+    return load_q_network(models_path() / "q_network/best.safetensors", 3)
 
 
 def test_plans_lead_to_the_goal_when_replayed(push_model, q_network):

@@ -377,7 +377,7 @@ def test_rhp_demonstrates_with_all_its_roll_outs():
 
 
 def test_the_guided_search_demonstrates():
-    network = load_q_network(models_path() / "q_network/three_boxes.safetensors", 3)
+    network = load_q_network(models_path() / "q_network/best.safetensors", 3)
     made, again = (GuidedDemonstrator(11, network).demonstrate(2) for _ in range(2))
     equal(made, again)
     assert goals_reached(made.states[-1], made.instance.goals)

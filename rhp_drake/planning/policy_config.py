@@ -12,7 +12,7 @@ from rhp_drake.planning.policy import Policy
 if TYPE_CHECKING:
     from rhp_drake.planning.open_loop import Planner
 
-DEFAULT_Q_NETWORK: Final = "package://rhp_drake/q_network/three_boxes.safetensors"
+DEFAULT_Q_NETWORK: Final = "package://rhp_drake/q_network/best.safetensors"
 
 
 @dataclass(kw_only=True)
