@@ -10,6 +10,7 @@ import multiprocessing
 from multiprocessing.connection import wait
 import os
 import signal
+import socket
 from threading import Thread
 from typing import Any, Final, TypeAlias, TypeVar
 
@@ -129,6 +130,7 @@ def _run_on_cluster(
         raise InputError(
             'a cluster needs Ray: pip install -c constraints.txt -e ".[distributed]".'
         ) from None
+    _check_reachable(cluster.address)
     try:
         ray.init(
             address=cluster.address, log_to_driver=False, logging_level=logging.ERROR
@@ -162,6 +164,20 @@ def _run_on_cluster(
         raise WorkError(f"the Ray cluster failed: {message}") from error
     finally:
         ray.shutdown()
+
+
+def _check_reachable(address: str) -> None:
+    """Raises an InputError if nobody listens at HOST:PORT.
+
+    Ray itself would wait for minutes and then end the process.
+    """
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon:
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=10).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(f"no Ray cluster at {address!r}: {error}.") from None
 
 
 def _run_remotely(function: Callable[[Item], Result], item: Item) -> Result:

@@ -48,7 +48,8 @@ def test_a_killed_worker_is_one_sentence():
         list(run_over(die, range(3), workers=2))
 
 
-def test_a_cluster_that_is_not_there():
+@pytest.mark.parametrize("address", ["nowhere", "127.0.0.1:1", "127.0.0.1:port"])
+def test_a_cluster_that_is_not_there(address):
     pytest.importorskip("ray")
-    with pytest.raises(InputError, match=r"no Ray cluster at 'nowhere'"):
-        list(run_over(refuse, range(3), RayCluster("nowhere")))
+    with pytest.raises(InputError, match=f"no Ray cluster at '{address}'"):
+        list(run_over(refuse, range(3), RayCluster(address)))
