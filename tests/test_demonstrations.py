@@ -15,13 +15,13 @@ import pytest
 import torch
 
 from rhp_drake.errors import InputError
+from rhp_drake.learning.dataset import load_dataset
 from rhp_drake.learning.demonstration import Demonstration, training_task
 from rhp_drake.learning.demonstration_files import about, lengths, read_table
 from rhp_drake.learning.demonstration_folder import (
     demonstrate_tasks,
     describe,
 )
-from rhp_drake.learning.demonstrations import load_demonstrations
 from rhp_drake.learning.demonstrators import (
     GuidedDemonstrator,
     PlanningDemonstrator,
@@ -49,7 +49,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def data(folder):
-    return load_demonstrations([folder])
+    return load_dataset([folder])
 
 
 def without_times(table):
@@ -219,20 +219,20 @@ def test_a_failure_of_the_physics_costs_one_task(tmp_path, caplog):
 
 def test_bad_files_are_named(folder, tmp_path):
     with pytest.raises(InputError, match="holds no demonstrations"):
-        load_demonstrations([tmp_path])
+        load_dataset([tmp_path])
     with pytest.raises(InputError, match="no such file"):
-        load_demonstrations([tmp_path / "nothing.parquet"])
+        load_dataset([tmp_path / "nothing.parquet"])
     path = tmp_path / "tasks_0000000.parquet"
     path.write_bytes(b"not a table")
     with pytest.raises(InputError, match=r"tasks_0000000\.parquet: not a readable"):
-        load_demonstrations([tmp_path])
+        load_dataset([tmp_path])
     good = (folder / path.name).read_bytes()
     path.write_bytes(good[: len(good) // 2])
     with pytest.raises(InputError, match=r"tasks_0000000\.parquet: not a readable"):
-        load_demonstrations([path])
+        load_dataset([path])
     pq.write_table(pq.read_table(folder).replace_schema_metadata(), path)
     with pytest.raises(InputError, match="its metadata know of no demonstrations"):
-        load_demonstrations([path])
+        load_dataset([path])
 
 
 def test_a_flipped_bit_is_found(folder, tmp_path):
@@ -243,7 +243,7 @@ def test_a_flipped_bit_is_found(folder, tmp_path):
         damaged[int(place * len(content))] ^= 0x10
         path.write_bytes(damaged)
         with pytest.raises(InputError, match="not a readable"):
-            load_demonstrations([path])
+            load_dataset([path])
 
 
 def test_other_versions_are_refused(folder, tmp_path):
@@ -253,7 +253,7 @@ def test_other_versions_are_refused(folder, tmp_path):
     path = tmp_path / "tasks_0000000.parquet"
     pq.write_table(table.replace_schema_metadata(metadata), path)
     with pytest.raises(InputError, match="has version 99"):
-        load_demonstrations([path])
+        load_dataset([path])
 
 
 def test_flat_arrays_agree_with_the_rows(folder, data):
@@ -293,7 +293,7 @@ def test_plans_end_at_the_goal(data):
 
 
 def test_folders_join(folder, data):
-    both = load_demonstrations([folder, folder / "tasks_0000000.parquet"])
+    both = load_dataset([folder, folder / "tasks_0000000.parquet"])
     assert len(both.goals) == 2 * len(data.goals)
     n = len(data.search_actions)
     second = both.search_origins[n:]
@@ -311,9 +311,17 @@ def test_seeds_and_actions_rebuild_the_states(folder, tmp_path):
     assert compact([folder / "tasks_0000000.parquet"], small) == solved
     assert pq.read_table(small).column_names == ["seed", "task", "solved", "actions"]
     assert rebuild(small, full) == solved
-    ours, rebuilt = load_demonstrations([folder]), load_demonstrations([full])
+    ours, rebuilt = load_dataset([folder]), load_dataset([full])
     np.testing.assert_array_equal(rebuilt.plan_states, ours.plan_states)
     np.testing.assert_array_equal(rebuilt.plan_actions, ours.plan_actions)
+    # Each plan is one chain of transitions.
+    np.testing.assert_array_equal(rebuilt.search_states, ours.plan_states)
+    np.testing.assert_array_equal(rebuilt.search_actions, ours.plan_actions)
+    linked = rebuilt.search_origins >= 0
+    assert (~linked).sum() == solved
+    np.testing.assert_array_equal(
+        rebuilt.search_origins[linked], np.flatnonzero(linked) - 1
+    )
     assert describe(full)["demonstrator"] == describe(folder)["demonstrator"]
 
     (replay,) = verify([folder / "tasks_0000000.parquet"], 1)
@@ -327,7 +335,7 @@ def test_compact_files_do_for_replay_only(folder, tmp_path):
     small = tmp_path / "compact.parquet"
     compact([folder / "tasks_0000000.parquet"], small)
     with pytest.raises(InputError, match=r"lacks the column goals; .* rebuild"):
-        load_demonstrations([small])
+        load_dataset([small])
     list(demonstrate_tasks(tmp_path / "two", range(2), Counts(num_objects=2), 1))
     with pytest.raises(InputError, match="different numbers of objects"):
         compact([small, tmp_path / "two/tasks_0000000.parquet"], tmp_path / "mixed")

@@ -8,8 +8,8 @@ import torch
 
 from rhp_drake.errors import InputError, WorkError
 from rhp_drake.learning.augmentation import Symmetry
+from rhp_drake.learning.dataset import load_dataset
 from rhp_drake.learning.demonstration_folder import demonstrate_tasks
-from rhp_drake.learning.demonstrations import load_demonstrations
 from rhp_drake.learning.demonstrators import PlanningDemonstrator
 from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, double_q_targets, sample
 from rhp_drake.learning.imitation import (
@@ -36,7 +36,7 @@ DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
 def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("demonstrations")
     list(demonstrate_tasks(path, range(25), DEMONSTRATOR, 1))
-    return load_demonstrations([path])
+    return load_dataset([path])
 
 
 def test_eq_2():

@@ -34,13 +34,13 @@ def imitate(
     """
     from rich.console import Console
 
-    from rhp_drake.learning.demonstrations import load_demonstrations
+    from rhp_drake.learning.dataset import load_dataset
     from rhp_drake.learning.imitation import Imitation, ImitationConfig
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import QNetwork
 
     prepare(out, seed)
-    data = load_demonstrations(demonstrations)
+    data = load_dataset(demonstrations)
     if not data.solved.any():
         raise InputError("none of the demonstrations holds a plan to imitate.")
     network = QNetwork(data.goals.shape[1])
@@ -67,7 +67,7 @@ def reinforce(
     """
     from rich.console import Console
 
-    from rhp_drake.learning.demonstrations import load_demonstrations
+    from rhp_drake.learning.dataset import load_dataset
     from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
     from rhp_drake.learning.reinforcement import Reinforcement, Rounds
     from rhp_drake.random_streams import stream
@@ -75,7 +75,7 @@ def reinforce(
     from rhp_drake.value.q_network import load_q_network
 
     prepare(out, seed)
-    data = load_demonstrations(demonstrations)
+    data = load_dataset(demonstrations)
     if not len(data.search_actions):
         raise InputError("none of the demonstrations holds a search to learn from.")
     network = load_q_network(start, data.goals.shape[1])
@@ -110,13 +110,13 @@ def fit(
     """
     from rich.console import Console
 
-    from rhp_drake.learning.demonstrations import load_demonstrations
+    from rhp_drake.learning.dataset import load_dataset
     from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import load_q_network
 
     prepare(out, seed)
-    sources = [load_demonstrations([path]) for path in demonstrations]
+    sources = [load_dataset([path]) for path in demonstrations]
     for path, source in zip(demonstrations, sources, strict=True):
         if not len(source.search_actions):
             raise InputError(f"{path}: holds no search to learn from.")

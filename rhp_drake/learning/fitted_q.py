@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from rhp_drake.learning.augmentation import Symmetry
-from rhp_drake.learning.demonstrations import Demonstrations
+from rhp_drake.learning.dataset import Dataset
 from rhp_drake.learning.learner import Learner
 from rhp_drake.task import (
     GOAL_RADIUS,
@@ -85,7 +85,7 @@ def _in_disc(centres: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 
 def sample(
-    sources: Sequence[Demonstrations], num_samples: int, generator: np.random.Generator
+    sources: Sequence[Dataset], num_samples: int, generator: np.random.Generator
 ) -> Samples:
     """Draws transitions and their goals, as many from each source."""
     shares = np.diff(np.arange(len(sources) + 1) * num_samples // len(sources))
@@ -101,9 +101,7 @@ def sample(
     )
 
 
-def _sample(
-    data: Demonstrations, num_samples: int, generator: np.random.Generator
-) -> Samples:
+def _sample(data: Dataset, num_samples: int, generator: np.random.Generator) -> Samples:
     num_hindsight = int(_HINDSIGHT * num_samples)
     rows = generator.integers(len(data.search_actions), size=num_samples)
     goals = data.goals[data.search_tasks[rows]]
@@ -186,7 +184,7 @@ class FittedQ(Learner):
     def __init__(
         self,
         network: QNetwork,
-        sources: Sequence[Demonstrations],
+        sources: Sequence[Dataset],
         config: FittedQConfig,
         generator: np.random.Generator,
     ) -> None:

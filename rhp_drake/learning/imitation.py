@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from rhp_drake.learning.augmentation import Symmetry
-from rhp_drake.learning.demonstrations import Demonstrations
+from rhp_drake.learning.dataset import Dataset
 from rhp_drake.learning.learner import Learner
 from rhp_drake.task import REWARD
 from rhp_drake.value.q_network import QNetwork
@@ -75,7 +75,7 @@ class Imitation(Learner):
     def __init__(
         self,
         network: QNetwork,
-        demonstrations: Demonstrations,
+        demonstrations: Dataset,
         config: ImitationConfig,
         generator: np.random.Generator,
     ) -> None:

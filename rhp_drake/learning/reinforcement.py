@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Final
 
 from rhp_drake.errors import InputError
-from rhp_drake.learning.demonstration_folder import demonstrate_tasks
-from rhp_drake.learning.demonstrations import (
-    Demonstrations,
+from rhp_drake.learning.dataset import (
+    Dataset,
     concatenate,
-    load_demonstrations,
+    load_dataset,
 )
+from rhp_drake.learning.demonstration_folder import demonstrate_tasks
 from rhp_drake.learning.demonstrators import RecedingHorizonDemonstrator
 from rhp_drake.learning.fitted_q import FittedQ
 from rhp_drake.workers import Workers
@@ -85,7 +85,7 @@ class Reinforcement:
         self._seed = seed
         self._workers = workers
         self._commit = commit
-        self._experience: list[Demonstrations] = []
+        self._experience: list[Dataset] = []
 
     def act(self) -> Iterator[int]:
         """Makes, or reads, the experience that the learner's next step needs.
@@ -97,7 +97,7 @@ class Reinforcement:
         if steps == 0:
             yield from self._act(index)
         for known in range(len(self._experience), index + 1):
-            self._experience.append(load_demonstrations([self._round(known)]))
+            self._experience.append(load_dataset([self._round(known)]))
             self._learner.sources = [
                 self._learner.sources[0],
                 concatenate(self._experience),

@@ -25,7 +25,7 @@ from rhp_drake.learning.demonstration_files import (
     to_table,
     write_table,
 )
-from rhp_drake.planning.search import SearchRecord
+from rhp_drake.planning.search import Search
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.task import goals_reached
 from rhp_drake.workers import run_over
@@ -86,7 +86,9 @@ def compact(paths: Sequence[Path], out: Path) -> int:
 
 
 def rebuild(path: Path, out: Path) -> int:
-    """Writes demonstrations with states, but no searches, from the compact form.
+    """Writes demonstrations with states from the compact form.
+
+    Their searches hold the transitions of the plans alone.
 
     Returns:
         The number of plans.
@@ -109,7 +111,7 @@ def _push_model(num_objects: int) -> PushModel:
 
 
 def _rebuild(table: pa.Table) -> list[Demonstration]:
-    """Demonstrations without searches, all plans executed side by side."""
+    """Demonstrations, all plans executed side by side."""
     num_objects = about(table)["num_objects"]
     push_model = _push_model(num_objects)
     seeds, tasks = table["seed"].to_pylist(), table["task"].to_pylist()
@@ -138,11 +140,19 @@ def _rebuild(table: pa.Table) -> list[Demonstration]:
             instance=instances[row],
             actions=actions[row] if solved[row] else None,
             states=np.array(states[row]),
-            search=SearchRecord(3 + 3 * num_objects).search(),
+            search=_along(np.array(states[row]), actions[row]),
             seconds=0.0,
         )
         for row in range(table.num_rows)
     ]
+
+
+def _along(states: np.ndarray, actions: np.ndarray) -> Search:
+    """The transitions of one sequence of actions, as far as its states go."""
+    num_steps = len(states) - 1
+    return Search(
+        states[:-1], actions[:num_steps], states[1:], np.arange(num_steps) - 1
+    )
 
 
 def _step(push_model: PushModel, states: np.ndarray, actions: np.ndarray) -> np.ndarray:

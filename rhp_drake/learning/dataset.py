@@ -14,7 +14,7 @@ from rhp_drake.learning.demonstration_folder import shard_paths
 
 
 @dataclass(frozen=True)
-class Demonstrations:
+class Dataset:
     """P tasks, their plans, and all T transitions that were simulated for them.
 
     Attributes:
@@ -64,7 +64,7 @@ _INDICES: Final = {
 }
 
 
-def load_demonstrations(paths: Sequence[Path]) -> Demonstrations:
+def load_dataset(paths: Sequence[Path]) -> Dataset:
     """Reads files of demonstrations, and all those of folders, in order.
 
     Raises:
@@ -75,7 +75,7 @@ def load_demonstrations(paths: Sequence[Path]) -> Demonstrations:
     )
 
 
-def _flatten(table: pa.Table) -> Demonstrations:
+def _flatten(table: pa.Table) -> Dataset:
     goals = numbers(table["goals"])
     plan_lengths = lengths(table["actions"])
     num_transitions = lengths(table["search_actions"])
@@ -93,7 +93,7 @@ def _flatten(table: pa.Table) -> Demonstrations:
     search_states = next_states[origins]
     search_states[at_root] = initial_states[search_tasks[at_root]]
     plan_ends = np.cumsum(plan_lengths)
-    return Demonstrations(
+    return Dataset(
         goals=goals.reshape(len(goals), -1, 2),
         plan_tasks=np.repeat(np.arange(table.num_rows, dtype=np.int32), plan_lengths),
         plan_states=states[before_end],
@@ -111,7 +111,7 @@ def _flatten(table: pa.Table) -> Demonstrations:
     )
 
 
-def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
+def concatenate(parts: Sequence[Dataset]) -> Dataset:
     """All of them as one, in order.
 
     Raises:
@@ -120,7 +120,7 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
     if len({part.goals.shape[1] for part in parts}) > 1:
         raise InputError("the demonstrations are of different numbers of objects.")
     arrays = {}
-    for field in fields(Demonstrations):
+    for field in fields(Dataset):
         values = [getattr(part, field.name) for part in parts]
         if field.name in _INDICES:
             sizes = [len(getattr(part, _INDICES[field.name])) for part in parts]
@@ -130,4 +130,4 @@ def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
                 for value, offset in zip(values, offsets, strict=True)
             ]
         arrays[field.name] = np.concatenate(values)
-    return Demonstrations(**arrays)
+    return Dataset(**arrays)
