@@ -62,3 +62,23 @@ class Symmetry:
     def action_masks(self, masks: torch.Tensor) -> torch.Tensor:
         """Masks of the actions (N, 6) seen through the symmetries."""
         return torch.where(self._mirrored[:, None], masks[:, _MIRRORED_ACTIONS], masks)
+
+
+class NoSymmetry:
+    """Leaves samples as they are; see `Symmetry`."""
+
+    def states(self, states: torch.Tensor) -> torch.Tensor:
+        """The same."""
+        return states
+
+    def goals(self, goals: torch.Tensor) -> torch.Tensor:
+        """The same."""
+        return goals
+
+    def actions(self, actions: torch.Tensor) -> torch.Tensor:
+        """The same."""
+        return actions
+
+    def action_masks(self, masks: torch.Tensor) -> torch.Tensor:
+        """The same."""
+        return masks

@@ -1,5 +1,6 @@
 """Who makes demonstrations: the RRT, a search guided by a Q-network, and RHP."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 import time
@@ -8,12 +9,13 @@ from typing import Final
 import numpy as np
 
 from rhp_drake.learning.demonstration import Demonstration, training_task
+from rhp_drake.physics import ObjectPhysics, draw_physics
 from rhp_drake.planning.best_first import plan_best_first
 from rhp_drake.planning.kinodynamic_rrt import plan
 from rhp_drake.planning.policy import PolicyError
 from rhp_drake.planning.receding_horizon import RecedingHorizon
 from rhp_drake.planning.search import Plan, Search, SearchRecord
-from rhp_drake.push_model.transition import PushModel
+from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.random_streams import TRAINING, stream
 from rhp_drake.task import (
     MAX_ACTIONS,
@@ -26,6 +28,8 @@ from rhp_drake.value.q_network import QNetwork
 
 # A task not solved with this many simulated actions yields its trees but no plan.
 _MAX_TRANSITIONS: Final = 6000
+# Limit of one search from a state that RHP came through; most need 90.
+_MAX_SEARCHED: Final = 300
 
 
 @dataclass(frozen=True)
@@ -95,17 +99,24 @@ class GuidedDemonstrator:
 class RecedingHorizonDemonstrator:
     """Acts by epsilon-RHP (section V of the paper), and keeps all its roll-outs.
 
+    Afterwards it may search, from some states that it came through, for better ways
+    to the goal: so the network learns what it should have done where RHP was lost.
+
     Attributes:
         seed: Of the tasks and the policy.
         q_network: RHP's; its m is that of the tasks.
         epsilon: How often the action is a random one.
         temperature: tau of Eq. 5, in actions.
+        uncertainty: Of the physics in which it acts, which RHP does not know.
+        num_searches: From how many states of an episode it searches, best first.
     """
 
     seed: int
     q_network: QNetwork
     epsilon: float = 0.1
     temperature: float = 0.5
+    uncertainty: str = "none"
+    num_searches: int = 0
 
     @property
     def num_objects(self) -> int:
@@ -124,6 +135,25 @@ class RecedingHorizonDemonstrator:
         """See `demonstration.Demonstrator`."""
         begin = time.perf_counter()
         instance = training_task(self.seed, task, self.num_objects)
+        physics = draw_physics(
+            self.uncertainty,
+            instance.initial_state,
+            stream(self.seed, TRAINING, task, "world_physics"),
+        )
+        states, actions = self._act(instance, physics, task)
+        self._search(states[:-1], instance.goals, task)
+        seconds = time.perf_counter() - begin
+        search = self._recorder.search()
+        if goals_reached(states[-1], instance.goals):
+            found = Plan(np.array(actions), np.array(states), search, seconds, seconds)
+        else:
+            found = Plan(None, instance.initial_state[None], search, seconds, np.nan)
+        return _demonstration(self.seed, task, instance, found)
+
+    def _act(
+        self, instance: TaskInstance, physics: ObjectPhysics, task: int
+    ) -> tuple[list[np.ndarray], list[int]]:
+        """An episode: its states, and the actions between them."""
         generator = stream(self.seed, TRAINING, task, "epsilon_rhp")
         state, goals = instance.initial_state, instance.goals
         self._recorder.forget()
@@ -132,23 +162,34 @@ class RecedingHorizonDemonstrator:
             explores = generator.random() < self.epsilon
             try:
                 decision = self._policy.decide(state, goals, generator)
-            except PolicyError:
+                action = decision.action
+                if explores:
+                    allowed = np.flatnonzero(allowed_actions(state))
+                    action = int(generator.choice(allowed))
+                state = self._recorder.execute(state, action, physics)
+            except (PolicyError, PushModelError):
+                # Where the boxes are smaller than RHP believes, they may come so close
+                # to one another that it sees them overlap.
                 break
-            action = decision.action
-            if explores:
-                action = int(generator.choice(np.flatnonzero(allowed_actions(state))))
-            state = self._recorder.step(state[None], np.array([action]))[0]
             states.append(state)
             actions.append(action)
             if goals_reached(state, goals) or objects_fallen(state):
                 break
-        seconds = time.perf_counter() - begin
-        search = self._recorder.search()
-        if goals_reached(state, goals):
-            found = Plan(np.array(actions), np.array(states), search, seconds, seconds)
-        else:
-            found = Plan(None, instance.initial_state[None], search, seconds, np.nan)
-        return _demonstration(self.seed, task, instance, found)
+        return states, actions
+
+    def _search(self, states: list[np.ndarray], goals: np.ndarray, task: int) -> None:
+        """Searches from some of the states; the recorder notes what is simulated."""
+        generator = stream(self.seed, TRAINING, task, "searched_states")
+        count = min(self.num_searches, len(states))
+        for index in generator.choice(len(states), count, replace=False):
+            with suppress(PushModelError):
+                plan_best_first(
+                    self._recorder,
+                    self.q_network,
+                    states[index],
+                    goals,
+                    max_transitions=_MAX_SEARCHED,
+                )
 
 
 def _demonstration(
@@ -177,6 +218,22 @@ class _RecordingPushModel:
         """All that was simulated since."""
         return self._record.search()
 
+    def execute(
+        self, state: np.ndarray, action: int, physics: ObjectPhysics
+    ) -> np.ndarray:
+        """The state after an action in a world of other physics."""
+        actions = np.array([action])
+        child = self._push_model.step(state[None], actions, physics)[0]
+        self._add(state, action, child)
+        return child
+
+    def _add(self, state: np.ndarray, action: int, child: np.ndarray) -> None:
+        origin = self._origins.get(state.tobytes(), -1)
+        (index,) = self._record.add(
+            state[None], np.array([action]), child[None], np.array([origin])
+        )
+        self._origins.setdefault(child.tobytes(), int(index))
+
     def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """See `PushModel.step`."""
         keys = [
@@ -188,12 +245,5 @@ class _RecordingPushModel:
             children = self._push_model.step(states[new], actions[new])
             for i, child in zip(new, children, strict=True):
                 self._known[keys[i]] = child
-                origin = self._origins.get(keys[i][0], -1)
-                (index,) = self._record.add(
-                    states[i : i + 1],
-                    actions[i : i + 1],
-                    child[None],
-                    np.array([origin]),
-                )
-                self._origins.setdefault(child.tobytes(), int(index))
+                self._add(states[i], int(actions[i]), child)
         return np.array([self._known[key] for key in keys])

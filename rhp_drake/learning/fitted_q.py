@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from rhp_drake.learning.augmentation import Symmetry
+from rhp_drake.learning.augmentation import NoSymmetry, Symmetry
 from rhp_drake.learning.dataset import Dataset
 from rhp_drake.learning.learner import Learner
 from rhp_drake.task import (
@@ -31,8 +31,6 @@ from rhp_drake.task import (
 )
 from rhp_drake.value.q_network import QNetwork
 
-# How many of a batch's samples get goals in hindsight.
-_HINDSIGHT: Final = 0.5
 # Hindsight looks at most this many actions ahead.
 _FORESIGHT: Final = 20
 # m: a target that moved less teaches nothing about pushing it.
@@ -47,6 +45,11 @@ class FittedQConfig:
         discount: gamma.
         l2: See `LearnerConfig`, as the next three.
         target_rate: How far the target network follows at each step.
+        hindsight: How many of a batch's samples get goals in hindsight.
+        search_returns: Whether a way to the goal that was simulated bounds the value.
+        double_q: Whether the target's action is the network's choice, not the target
+            network's own.
+        symmetry: Whether samples are seen through random symmetries.
     """
 
     discount: float = 1.0
@@ -55,6 +58,10 @@ class FittedQConfig:
     batch_size: int = 1024
     num_steps: int = 40_000
     target_rate: float = 0.005
+    hindsight: float = 0.5
+    search_returns: bool = True
+    double_q: bool = True
+    symmetry: bool = True
 
 
 @dataclass(frozen=True)
@@ -85,12 +92,13 @@ def _in_disc(centres: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 
 def sample(
-    sources: Sequence[Dataset], num_samples: int, generator: np.random.Generator
+    sources: Sequence[Dataset], config: FittedQConfig, generator: np.random.Generator
 ) -> Samples:
-    """Draws transitions and their goals, as many from each source."""
+    """Draws a batch of transitions and their goals, as many from each source."""
+    num_samples = config.batch_size
     shares = np.diff(np.arange(len(sources) + 1) * num_samples // len(sources))
     parts = [
-        _sample(source, int(share), generator)
+        _sample(source, int(share), config, generator)
         for source, share in zip(sources, shares, strict=True)
     ]
     return Samples(
@@ -101,11 +109,15 @@ def sample(
     )
 
 
-def _sample(data: Dataset, num_samples: int, generator: np.random.Generator) -> Samples:
-    num_hindsight = int(_HINDSIGHT * num_samples)
+def _sample(
+    data: Dataset,
+    num_samples: int,
+    config: FittedQConfig,
+    generator: np.random.Generator,
+) -> Samples:
+    num_hindsight = int(config.hindsight * num_samples)
     rows = generator.integers(len(data.search_actions), size=num_samples)
     goals = data.goals[data.search_tasks[rows]]
-    least = np.full(num_samples, -np.inf)
 
     # The first of them in hindsight: `ends` is where the goals come from, `rows` a
     # transition on the way there, `num_actions` of them before the end.
@@ -117,6 +129,10 @@ def _sample(data: Dataset, num_samples: int, generator: np.random.Generator) -> 
         back = (num_actions < wanted) & (origins >= 0)
         rows[:num_hindsight][back] = origins[back]
         num_actions[back] += 1
+    least = np.full(num_samples, -np.inf)
+    if config.search_returns:
+        left = data.search_actions_left[rows]
+        least[left > 0] = REWARD * left[left > 0]
     start = object_positions(data.search_states[rows[:num_hindsight]])
     end = object_positions(data.search_next_states[ends])
     moved = np.linalg.norm(end[:, 0] - start[:, 0], axis=1) > _LEAST_MOTION
@@ -208,22 +224,27 @@ class FittedQ(Learner):
 
     def _loss(self) -> torch.Tensor:
         config, network = self._config, self.network
-        batch = sample(self.sources, config.batch_size, self._generator)
+        batch = sample(self.sources, config, self._generator)
         reached = torch.from_numpy(goals_reached(batch.next_states, batch.goals))
         fallen = torch.from_numpy(objects_fallen(batch.next_states))
         allowed = torch.from_numpy(allowed_actions(batch.next_states))
         # An episode ends at the goal: nobody asks for values there.
         asked = torch.from_numpy(~goals_reached(batch.states, batch.goals))
 
-        symmetry = Symmetry(len(asked), network.num_objects, self._generator)
+        symmetry = (
+            Symmetry(len(asked), network.num_objects, self._generator)
+            if config.symmetry
+            else NoSymmetry()
+        )
         goals = symmetry.goals(torch.from_numpy(batch.goals).float())
         states = symmetry.states(torch.from_numpy(batch.states))
         next_states = symmetry.states(torch.from_numpy(batch.next_states))
         actions = symmetry.actions(torch.from_numpy(batch.actions).long())
         with torch.no_grad():
+            target_q_next = self._target(next_states, goals)
             targets = double_q_targets(
-                network(next_states, goals),
-                self._target(next_states, goals),
+                network(next_states, goals) if config.double_q else target_q_next,
+                target_q_next,
                 symmetry.action_masks(allowed),
                 reached,
                 fallen,

@@ -39,12 +39,16 @@ class Rounds:
         num_steps: Gradient steps of a round.
         epsilon: How often RHP's action is a random one.
         temperature: tau of Eq. 5.
+        uncertainty: Of the physics in which RHP acts; it does not know them.
+        num_searches: From how many states of each task better ways are searched.
     """
 
     num_tasks: int = 100
     num_steps: int = 1000
     epsilon: float = 0.1
     temperature: float = 0.5
+    uncertainty: str = "high"
+    num_searches: int = 3
 
 
 class Reinforcement:
@@ -114,6 +118,8 @@ class Reinforcement:
             deepcopy(self._learner.network),
             self.rounds.epsilon,
             self.rounds.temperature,
+            self.rounds.uncertainty,
+            self.rounds.num_searches,
         )
         yield from demonstrate_tasks(
             self._round(index),
