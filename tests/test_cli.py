@@ -9,7 +9,7 @@ import pytest
 from rhp_drake import cli
 from rhp_drake.value.q_network import QNetwork
 
-COMMANDS = ("run", "plan", "demos", "imitate", "fit", "reinforce", "evaluate", "bench")
+COMMANDS = ("run", "plan", "demos", "imitate", "reinforce", "evaluate", "bench")
 
 
 def rhp(monkeypatch, *arguments) -> int:

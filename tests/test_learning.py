@@ -97,7 +97,7 @@ def test_double_q_targets_by_hand():
 
 def test_hindsight_goals_are_reached_in_time(data):
     """Following the search from a sample to its end meets the goals it was given."""
-    samples = sample([data], 4000, stream(1))
+    samples = sample([data], FittedQConfig(batch_size=4000), stream(1))
     known = np.isfinite(samples.least_returns)
     assert known.mean() > 0.05
     # One action is enough where the least return says so.

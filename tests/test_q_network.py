@@ -11,7 +11,11 @@ from rhp_drake.task import NUM_ACTIONS, sample_instance
 from rhp_drake.value.features import HAND_FEATURES, features, num_features
 from rhp_drake.value.q_network import QNetwork, load_q_network
 
-PROVENANCE = {"command": "fit", "seed": 3, "metrics": {"loss": 0.25, "sets": ["a"]}}
+PROVENANCE = {
+    "command": "rhp reinforce",
+    "seed": 3,
+    "metrics": {"loss": 0.25, "sets": ["a"]},
+}
 
 
 @pytest.fixture(scope="module")

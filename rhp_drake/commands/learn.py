@@ -1,14 +1,15 @@
-"""`rhp imitate`, `rhp fit` and `rhp reinforce`: from demonstrations to a Q-network."""
+"""`rhp imitate` and `rhp reinforce`: from demonstrations to a Q-network."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rhp_drake.commands.training import prepare, train
+from rhp_drake.commands.training import train_and_save
 from rhp_drake.errors import InputError
+from rhp_drake.files import check_writable
 
 # torch and Drake are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -36,17 +37,19 @@ def imitate(
 
     from rhp_drake.learning.dataset import load_dataset
     from rhp_drake.learning.imitation import Imitation, ImitationConfig
+    from rhp_drake.learning.training import make_repeatable
     from rhp_drake.random_streams import stream
     from rhp_drake.value.q_network import QNetwork
 
-    prepare(out, seed)
+    check_writable(out)
+    make_repeatable(seed)
     data = load_dataset(demonstrations)
     if not data.solved.any():
         raise InputError("none of the demonstrations holds a plan to imitate.")
     network = QNetwork(data.goals.shape[1])
     config = ImitationConfig(num_steps=steps)
     learner = Imitation(network, data, config, stream(seed, "imitation"))
-    train(learner, out, demonstrations, {"seed": seed}, Console())
+    train_and_save(learner, out, demonstrations, {"seed": seed}, Console())
 
 
 def reinforce(
@@ -56,6 +59,9 @@ def reinforce(
     out: _Out,
     seed: _Seed = 0,
     steps: _Steps = 40_000,
+    variant: Annotated[
+        str, typer.Option(help="best, or paper: as the paper does it.")
+    ] = "best",
     workers: Annotated[
         int, typer.Option(min=1, help="How many processes act on this machine.")
     ] = 2,
@@ -68,63 +74,35 @@ def reinforce(
     from rich.console import Console
 
     from rhp_drake.learning.dataset import load_dataset
-    from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
-    from rhp_drake.learning.reinforcement import Reinforcement, Rounds
+    from rhp_drake.learning.fitted_q import FittedQ
+    from rhp_drake.learning.reinforcement import Reinforcement
+    from rhp_drake.learning.training import make_repeatable
+    from rhp_drake.learning.variants import VARIANTS
     from rhp_drake.random_streams import stream
     from rhp_drake.run_record import source_commit
     from rhp_drake.value.q_network import load_q_network
 
-    prepare(out, seed)
+    if variant not in VARIANTS:
+        raise InputError(f"--variant: {variant!r} is not one of {', '.join(VARIANTS)}.")
+    check_writable(out)
+    make_repeatable(seed)
     data = load_dataset(demonstrations)
     if not len(data.search_actions):
         raise InputError("none of the demonstrations holds a search to learn from.")
     network = load_q_network(start, data.goals.shape[1])
-    rounds = Rounds()
-    learner = FittedQ(
-        network, [data], FittedQConfig(num_steps=steps), stream(seed, "reinforcement")
-    )
+    chosen = VARIANTS[variant]
+    config = replace(chosen.learning, num_steps=steps)
+    learner = FittedQ(network, [data], config, stream(seed, "reinforcement"))
     reinforcement = Reinforcement(
         learner,
-        rounds,
+        chosen.rounds,
         out.with_name(out.name + ".rounds"),
         seed,
         workers,
         source_commit(),
     )
-    origin = _origin(seed, start, network) | {"rounds": asdict(rounds)}
-    train(learner, out, demonstrations, origin, Console(), reinforcement)
-
-
-def fit(
-    *,
-    demonstrations: _Demos,
-    start: _Start,
-    out: _Out,
-    seed: _Seed = 0,
-    steps: _Steps = 40_000,
-) -> None:
-    """Improves a Q-network by double Q-learning on all that the searches simulated.
-
-    You may stop this at any moment: the same command goes on from its last checkpoint,
-    a file beside the weights.
-    """
-    from rich.console import Console
-
-    from rhp_drake.learning.dataset import load_dataset
-    from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
-    from rhp_drake.random_streams import stream
-    from rhp_drake.value.q_network import load_q_network
-
-    prepare(out, seed)
-    sources = [load_dataset([path]) for path in demonstrations]
-    for path, source in zip(demonstrations, sources, strict=True):
-        if not len(source.search_actions):
-            raise InputError(f"{path}: holds no search to learn from.")
-    network = load_q_network(start, sources[0].goals.shape[1])
-    config = FittedQConfig(num_steps=steps)
-    learner = FittedQ(network, sources, config, stream(seed, "fitted_q"))
-    origin = _origin(seed, start, network)
-    train(learner, out, demonstrations, origin, Console())
+    origin = _origin(seed, start, network) | {"rounds": asdict(chosen.rounds)}
+    train_and_save(learner, out, demonstrations, origin, Console(), reinforcement)
 
 
 def _origin(seed: int, start: Path, network: "QNetwork") -> dict[str, Any]:

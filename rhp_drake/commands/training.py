@@ -1,9 +1,11 @@
-"""What the commands that train a Q-network share: the loop, and the weights' file."""
+"""What the commands that train a Q-network share: progress, logs, the weights' file."""
 
 from dataclasses import asdict
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Any, Final
+
+import typer
 
 # torch and Drake are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -11,30 +13,12 @@ if TYPE_CHECKING:
 
     from rhp_drake.learning.learner import Learner
     from rhp_drake.learning.reinforcement import Reinforcement
-    from rhp_drake.value.q_network import QNetwork
 
-VALIDATION_TASKS: Final = 200
-# Steps between checkpoints, and between validations.
-_CHECKPOINT_PERIOD: Final = 1000
-_VALIDATION_PERIOD: Final = 4000
 _LOG_PERIOD: Final = 100
+_VALIDATION_PERIOD: Final = 4000
 
 
-def prepare(out: Path, seed: int) -> None:
-    """Makes sure that the weights can be written, and training repeated."""
-    import torch
-
-    from rhp_drake.files import check_writable
-
-    check_writable(out)
-    torch.manual_seed(seed)
-    # As everywhere else: the same bits on machines of more cores.
-    torch.set_num_threads(1)
-    # Gradients of dead units get so small that arithmetic takes five times as long.
-    torch.set_flush_denormal(True)
-
-
-def train(
+def train_and_save(
     learner: "Learner",
     out: Path,
     sources: list[Path],
@@ -54,44 +38,23 @@ def train(
         origin: What else the result depends on, for checkpoint and provenance.
         console: Where to say things.
         reinforcement: Makes experience on the way.
-    """
-    from torch.utils.tensorboard import SummaryWriter
 
-    from rhp_drake.commands.progress import make_progress
+    Raises:
+        typer.Exit: With status 130 after Ctrl-C.
+    """
+    from rhp_drake.evaluation.validation import greedy_successes
     from rhp_drake.learning.demonstration_folder import describe
     from rhp_drake.run_record import source_commit
 
+    # Before the work: it may be long, and the code may change meanwhile.
     commit = source_commit()
     origin |= {"demonstrations": [describe(path) for path in sources]}
     checkpoint = out.with_name(out.name + ".checkpoint")
-    if checkpoint.exists():
-        learner.resume(checkpoint, origin)
-        console.print(f"Goes on from step {learner.num_steps} of {checkpoint}.")
-    total = learner.config.num_steps
-    logs = out.with_name(out.name + ".logs")
-    with (
-        SummaryWriter(str(logs), purge_step=learner.num_steps) as writer,
-        make_progress(console) as progress,
-    ):
-        bar = progress.add_task("Steps", total=total, completed=learner.num_steps)
-        acting = progress.add_task("Tasks", visible=False)
-        while learner.num_steps < total:
-            if reinforcement is not None:
-                for done in reinforcement.act():
-                    tasks = reinforcement.rounds.num_tasks
-                    progress.update(acting, completed=done, total=tasks, visible=True)
-            learner.step()
-            step = learner.num_steps
-            if step % _LOG_PERIOD == 0:
-                loss = learner.mean_loss
-                progress.update(bar, completed=step, description=f"loss {loss:.3f}")
-                writer.add_scalar("loss", loss, step)
-            if step % _VALIDATION_PERIOD == 0 or step == total:
-                successes, trials = greedy_successes(learner.network)
-                if trials:
-                    writer.add_scalar("greedy success", successes / trials, step)
-            if step % _CHECKPOINT_PERIOD == 0:
-                learner.save(checkpoint, origin)
+    try:
+        _train(learner, out, checkpoint, origin, console, reinforcement)
+    except KeyboardInterrupt:
+        console.print("Stopped; the same command goes on from its last checkpoint.")
+        raise typer.Exit(130) from None
     network = learner.network
     successes, trials = greedy_successes(network)
     network.provenance = {
@@ -110,24 +73,44 @@ def train(
     )
 
 
-def greedy_successes(network: "QNetwork") -> tuple[int, int]:
-    """How many of some validation tasks the greedy policy solves, and of how many.
+def _train(
+    learner: "Learner",
+    out: Path,
+    checkpoint: Path,
+    origin: dict[str, Any],
+    console: "Console",
+    reinforcement: "Reinforcement | None",
+) -> None:
+    from torch.utils.tensorboard import SummaryWriter
 
-    There are frozen tasks for three objects only: of none otherwise.
-    """
-    from rhp_drake.evaluation.episode import run_episode
-    from rhp_drake.frozen_instances import load_instances
-    from rhp_drake.planning.receding_horizon import RecedingHorizon
-    from rhp_drake.push_model.transition import PushModel
-    from rhp_drake.random_streams import VALIDATION
+    from rhp_drake.commands.progress import make_progress
+    from rhp_drake.evaluation.validation import greedy_successes
+    from rhp_drake.learning.training import Acted, train
 
-    instances = load_instances(VALIDATION)[:VALIDATION_TASKS]
-    if network.num_objects != instances[0].num_objects:
-        return 0, 0
-    world = PushModel(network.num_objects)
-    policy = RecedingHorizon(world, network, 0, 0, 1.0)
-    episodes = [
-        run_episode(world, policy, instance, 0, index)
-        for index, instance in enumerate(instances)
-    ]
-    return sum(episode.succeeded for episode in episodes), len(instances)
+    steps = train(learner, checkpoint, origin, reinforcement)
+    total = learner.config.num_steps
+    logs = out.with_name(out.name + ".logs")
+    with (
+        SummaryWriter(str(logs), purge_step=learner.num_steps) as writer,
+        make_progress(console) as progress,
+    ):
+        if learner.num_steps:
+            console.print(f"Goes on from step {learner.num_steps} of {checkpoint}.")
+        bar = progress.add_task("Steps", total=total, completed=learner.num_steps)
+        acting = progress.add_task("Tasks", visible=False)
+        for event in steps:
+            if isinstance(event, Acted):
+                tasks = reinforcement.rounds.num_tasks if reinforcement else None
+                progress.update(
+                    acting, completed=event.num_tasks, total=tasks, visible=True
+                )
+                continue
+            step = event.num_steps
+            if step % _LOG_PERIOD == 0:
+                loss = learner.mean_loss
+                progress.update(bar, completed=step, description=f"loss {loss:.3f}")
+                writer.add_scalar("loss", loss, step)
+            if step % _VALIDATION_PERIOD == 0 and step < total:
+                successes, trials = greedy_successes(learner.network)
+                if trials:
+                    writer.add_scalar("greedy success", successes / trials, step)

@@ -1,7 +1,7 @@
 """Demonstrations as flat arrays, which training draws its samples from."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Final
 
@@ -128,6 +128,21 @@ def _actions_left(reached: np.ndarray, origins: np.ndarray) -> np.ndarray:
         if left[index] and origin >= 0 and not 0 < left[origin] <= left[index] + 1:
             left[origin] = left[index] + 1
     return left
+
+
+def without_oldest(data: Dataset, num_transitions: int) -> Dataset:
+    """The dataset without its first so many transitions; the plans stay."""
+    kept = slice(num_transitions, None)
+    origins = data.search_origins[kept] - num_transitions
+    return replace(
+        data,
+        search_tasks=data.search_tasks[kept],
+        search_states=data.search_states[kept],
+        search_actions=data.search_actions[kept],
+        search_next_states=data.search_next_states[kept],
+        search_origins=np.maximum(origins, -1),
+        search_actions_left=data.search_actions_left[kept],
+    )
 
 
 def concatenate(parts: Sequence[Dataset]) -> Dataset:

@@ -14,7 +14,7 @@ from rhp_drake.planning.best_first import plan_best_first
 from rhp_drake.planning.kinodynamic_rrt import plan
 from rhp_drake.planning.policy import PolicyError
 from rhp_drake.planning.receding_horizon import RecedingHorizon
-from rhp_drake.planning.search import Plan, Search, SearchRecord
+from rhp_drake.planning.search import Plan, Search, SearchRecord, chain
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.random_streams import TRAINING, stream
 from rhp_drake.task import (
@@ -97,10 +97,12 @@ class GuidedDemonstrator:
 
 @dataclass(frozen=True)
 class RecedingHorizonDemonstrator:
-    """Acts by epsilon-RHP (section V of the paper), and keeps all its roll-outs.
+    """Acts by epsilon-RHP (section V of the paper).
 
-    Afterwards it may search, from some states that it came through, for better ways
-    to the goal: so the network learns what it should have done where RHP was lost.
+    It keeps what was executed, as the paper's replay buffer does, or all roll-outs,
+    which are more and as true.  Afterwards it may search, from some of the states that
+    it came through, for better ways to the goal: so the network learns what it should
+    have done where RHP was lost.
 
     Attributes:
         seed: Of the tasks and the policy.
@@ -109,6 +111,7 @@ class RecedingHorizonDemonstrator:
         temperature: tau of Eq. 5, in actions.
         uncertainty: Of the physics in which it acts, which RHP does not know.
         num_searches: From how many states of an episode it searches, best first.
+        executed_only: Whether it keeps nothing but what was executed.
     """
 
     seed: int
@@ -117,6 +120,7 @@ class RecedingHorizonDemonstrator:
     temperature: float = 0.5
     uncertainty: str = "none"
     num_searches: int = 0
+    executed_only: bool = False
 
     @property
     def num_objects(self) -> int:
@@ -143,7 +147,11 @@ class RecedingHorizonDemonstrator:
         states, actions = self._act(instance, physics, task)
         self._search(states[:-1], instance.goals, task)
         seconds = time.perf_counter() - begin
-        search = self._recorder.search()
+        search = (
+            chain(np.array(states), np.array(actions, int))
+            if self.executed_only
+            else self._recorder.search()
+        )
         if goals_reached(states[-1], instance.goals):
             found = Plan(np.array(actions), np.array(states), search, seconds, seconds)
         else:

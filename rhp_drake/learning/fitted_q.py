@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.functional import mse_loss, smooth_l1_loss
 
 from rhp_drake.learning.augmentation import NoSymmetry, Symmetry
 from rhp_drake.learning.dataset import Dataset
@@ -50,6 +51,7 @@ class FittedQConfig:
         double_q: Whether the target's action is the network's choice, not the target
             network's own.
         symmetry: Whether samples are seen through random symmetries.
+        squared_errors: Whether errors above 1 count squared, or by their size.
     """
 
     discount: float = 1.0
@@ -62,6 +64,7 @@ class FittedQConfig:
     search_returns: bool = True
     double_q: bool = True
     symmetry: bool = True
+    squared_errors: bool = False
 
 
 @dataclass(frozen=True)
@@ -253,5 +256,6 @@ class FittedQ(Learner):
             least = torch.from_numpy(batch.least_returns).float()
             targets = torch.maximum(targets, least)
         q = network(states, goals).gather(1, actions[:, None])[:, 0]
-        losses = torch.nn.functional.smooth_l1_loss(q, targets, reduction="none")
+        loss = mse_loss if config.squared_errors else smooth_l1_loss
+        losses = loss(q, targets, reduction="none")
         return (losses * asked).mean()

@@ -5,8 +5,9 @@ the network learns from all rounds and the demonstrations.  So acting can be spr
 processes, and a round's experience is a folder of demonstrations like any other: work
 that is stopped goes on where it was, with the same result.
 
-The paper's replay buffer holds what was executed.  This one holds all that RHP
-simulated to decide, which is twenty times as much and as true.
+The paper's replay buffer holds what was executed, and loses an old transition for each
+new one.  So it is here, too, if only executed transitions are kept; else demonstrations
+and experience have equal shares of each batch, and nothing is lost.
 """
 
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from rhp_drake.learning.dataset import (
     Dataset,
     concatenate,
     load_dataset,
+    without_oldest,
 )
 from rhp_drake.learning.demonstration_folder import demonstrate_tasks
 from rhp_drake.learning.demonstrators import RecedingHorizonDemonstrator
@@ -41,6 +43,7 @@ class Rounds:
         temperature: tau of Eq. 5.
         uncertainty: Of the physics in which RHP acts; it does not know them.
         num_searches: From how many states of each task better ways are searched.
+        executed_only: Whether roll-outs and searches are not learned from.
     """
 
     num_tasks: int = 100
@@ -49,6 +52,7 @@ class Rounds:
     temperature: float = 0.5
     uncertainty: str = "high"
     num_searches: int = 3
+    executed_only: bool = False
 
 
 class Reinforcement:
@@ -89,6 +93,7 @@ class Reinforcement:
         self._seed = seed
         self._workers = workers
         self._commit = commit
+        (self._demonstrations,) = learner.sources
         self._experience: list[Dataset] = []
 
     def act(self) -> Iterator[int]:
@@ -102,10 +107,14 @@ class Reinforcement:
             yield from self._act(index)
         for known in range(len(self._experience), index + 1):
             self._experience.append(load_dataset([self._round(known)]))
-            self._learner.sources = [
-                self._learner.sources[0],
-                concatenate(self._experience),
-            ]
+            self._learner.sources = self._replay_buffer()
+
+    def _replay_buffer(self) -> list[Dataset]:
+        experience = concatenate(self._experience)
+        if not self.rounds.executed_only:
+            return [self._demonstrations, experience]
+        both = concatenate([self._demonstrations, experience])
+        return [without_oldest(both, len(experience.search_actions))]
 
     def _round(self, index: int) -> Path:
         return self._folder / f"round_{index:04d}"
@@ -120,6 +129,7 @@ class Reinforcement:
             self.rounds.temperature,
             self.rounds.uncertainty,
             self.rounds.num_searches,
+            self.rounds.executed_only,
         )
         yield from demonstrate_tasks(
             self._round(index),

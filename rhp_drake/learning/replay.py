@@ -25,7 +25,7 @@ from rhp_drake.learning.demonstration_files import (
     to_table,
     write_table,
 )
-from rhp_drake.planning.search import Search
+from rhp_drake.planning.search import chain
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.task import goals_reached
 from rhp_drake.workers import run_over
@@ -140,19 +140,12 @@ def _rebuild(table: pa.Table) -> list[Demonstration]:
             instance=instances[row],
             actions=actions[row] if solved[row] else None,
             states=np.array(states[row]),
-            search=_along(np.array(states[row]), actions[row]),
+            # As far as its states go.
+            search=chain(np.array(states[row]), actions[row][: len(states[row]) - 1]),
             seconds=0.0,
         )
         for row in range(table.num_rows)
     ]
-
-
-def _along(states: np.ndarray, actions: np.ndarray) -> Search:
-    """The transitions of one sequence of actions, as far as its states go."""
-    num_steps = len(states) - 1
-    return Search(
-        states[:-1], actions[:num_steps], states[1:], np.arange(num_steps) - 1
-    )
 
 
 def _step(push_model: PushModel, states: np.ndarray, actions: np.ndarray) -> np.ndarray:

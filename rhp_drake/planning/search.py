@@ -32,6 +32,16 @@ class Search:
     origins: np.ndarray
 
 
+def chain(states: np.ndarray, actions: np.ndarray) -> Search:
+    """The transitions along one sequence of actions.
+
+    Args:
+        states: s_0 ... s_L, shape (L + 1, 3 + 3 m).
+        actions: Shape (L,).
+    """
+    return Search(states[:-1], actions, states[1:], np.arange(len(actions)) - 1)
+
+
 @dataclass(frozen=True)
 class Plan:
     """What a planner found.

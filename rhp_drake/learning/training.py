@@ -1,0 +1,89 @@
+"""The training loop: acting where there is reinforcement, learning, checkpoints."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+
+from rhp_drake.learning.learner import Learner
+from rhp_drake.learning.reinforcement import Reinforcement
+
+# Steps between checkpoints.
+_CHECKPOINT_PERIOD: Final = 1000
+
+
+@dataclass(frozen=True)
+class Acted:
+    """Told by `train` while RHP acts for the learner's next steps.
+
+    Attributes:
+        num_tasks: Done in this round.
+    """
+
+    num_tasks: int
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """Told by `train` after each gradient step.
+
+    Attributes:
+        num_steps: Taken so far.
+    """
+
+    num_steps: int
+
+
+def make_repeatable(seed: int) -> None:
+    """Sets torch so that training is the same bits on any number of cores."""
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    # Gradients of dead units get so small that arithmetic takes five times as long.
+    torch.set_flush_denormal(True)
+
+
+def train(
+    learner: Learner,
+    checkpoint: Path,
+    origin: dict[str, Any],
+    reinforcement: Reinforcement | None = None,
+) -> Iterator[Acted | Stepped]:
+    """Trains to the end, from the checkpoint if there is one.
+
+    Whoever stops at any moment, and calls this again with a new learner, gets the same
+    network.  The checkpoint stays; it is for the caller to remove once the weights are
+    safe.
+
+    Args:
+        learner: Trains its network.
+        checkpoint: The file.
+        origin: What else the result depends on, see `Learner.save`.
+        reinforcement: Makes experience on the way.
+
+    Raises:
+        InputError: If the checkpoint is of other work.
+        WorkError: If the loss is not finite, or nothing can be written.
+    """
+    if checkpoint.exists():
+        learner.resume(checkpoint, origin)
+    # Not a generator itself: the learner is resumed before the first step is asked for.
+    return _train(learner, checkpoint, origin, reinforcement)
+
+
+def _train(
+    learner: Learner,
+    checkpoint: Path,
+    origin: dict[str, Any],
+    reinforcement: Reinforcement | None,
+) -> Iterator[Acted | Stepped]:
+    while learner.num_steps < learner.config.num_steps:
+        if reinforcement is not None:
+            for done in reinforcement.act():
+                yield Acted(done)
+        learner.step()
+        last = learner.num_steps == learner.config.num_steps
+        if learner.num_steps % _CHECKPOINT_PERIOD == 0 or last:
+            learner.save(checkpoint, origin)
+        yield Stepped(learner.num_steps)
