@@ -109,6 +109,8 @@ class RecedingHorizonDemonstrator:
         q_network: RHP's; its m is that of the tasks.
         epsilon: How often the action is a random one.
         temperature: tau of Eq. 5, in actions.
+        num_roll_outs: n.
+        horizon: h; 0 makes it epsilon-greedy.
         uncertainty: Of the physics in which it acts, which RHP does not know.
         num_searches: From how many states of an episode it searches, best first.
         executed_only: Whether it keeps nothing but what was executed.
@@ -118,6 +120,8 @@ class RecedingHorizonDemonstrator:
     q_network: QNetwork
     epsilon: float = 0.1
     temperature: float = 0.5
+    num_roll_outs: int = 6
+    horizon: int = 6
     uncertainty: str = "none"
     num_searches: int = 0
     executed_only: bool = False
@@ -133,7 +137,13 @@ class RecedingHorizonDemonstrator:
 
     @cached_property
     def _policy(self) -> RecedingHorizon:
-        return RecedingHorizon(self._recorder, self.q_network, 6, 6, self.temperature)
+        return RecedingHorizon(
+            self._recorder,
+            self.q_network,
+            self.num_roll_outs,
+            self.horizon,
+            self.temperature,
+        )
 
     def demonstrate(self, task: int) -> Demonstration:
         """See `demonstration.Demonstrator`."""

@@ -41,6 +41,8 @@ class Rounds:
         num_steps: Gradient steps of a round.
         epsilon: How often RHP's action is a random one.
         temperature: tau of Eq. 5.
+        num_roll_outs: n.
+        horizon: h.
         uncertainty: Of the physics in which RHP acts; it does not know them.
         num_searches: From how many states of each task better ways are searched.
         executed_only: Whether roll-outs and searches are not learned from.
@@ -50,6 +52,8 @@ class Rounds:
     num_steps: int = 1000
     epsilon: float = 0.1
     temperature: float = 0.5
+    num_roll_outs: int = 6
+    horizon: int = 6
     uncertainty: str = "high"
     num_searches: int = 3
     executed_only: bool = False
@@ -125,11 +129,13 @@ class Reinforcement:
             self._seed,
             # The network goes on learning.
             deepcopy(self._learner.network),
-            self.rounds.epsilon,
-            self.rounds.temperature,
-            self.rounds.uncertainty,
-            self.rounds.num_searches,
-            self.rounds.executed_only,
+            epsilon=self.rounds.epsilon,
+            temperature=self.rounds.temperature,
+            num_roll_outs=self.rounds.num_roll_outs,
+            horizon=self.rounds.horizon,
+            uncertainty=self.rounds.uncertainty,
+            num_searches=self.rounds.num_searches,
+            executed_only=self.rounds.executed_only,
         )
         yield from demonstrate_tasks(
             self._round(index),
