@@ -7,8 +7,9 @@ import pytest
 
 from rhp_drake import task
 from rhp_drake.errors import InputError
-from rhp_drake.planning.checked_plan import CheckedPlan, deviation
+from rhp_drake.planning.checked_plan import CheckedPlan
 from rhp_drake.planning.kinodynamic_rrt import plan
+from rhp_drake.planning.plan_rest import deviation
 from rhp_drake.planning.policy import PolicyError
 from rhp_drake.planning.policy_config import POLICIES, CheckedPlanConfig, MakePolicy
 from rhp_drake.planning.search import Plan, SearchRecord

@@ -1,17 +1,14 @@
 """KDP with open eyes: a plan is executed while the scene is as the plan expects."""
 
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from rhp_drake.planning.kinodynamic_rrt import plan
-from rhp_drake.planning.open_loop import Planner, PlanRest
+from rhp_drake.planning.open_loop import Planner
+from rhp_drake.planning.plan_rest import PlanRest
 from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.push_model.transition import PushModel
-from rhp_drake.task import allowed_actions, object_positions
-
-# m: from the hand's origin to a fingertip, which a wrong heading takes astray.
-_FINGERTIP: Final = 0.08
 
 
 class CheckedPlan:
@@ -48,7 +45,7 @@ class CheckedPlan:
         memory: Any = None,
     ) -> Decision:
         """The next action of the plan, old or new; see `policy.Policy`."""
-        if memory is not None and self._holds(memory, state):
+        if memory is not None and memory.holds(state, self._tolerance):
             return memory.decision()
         found = self._planner(
             self._push_model, state, goals, generator, time_limit=self._time_limit
@@ -61,30 +58,3 @@ class CheckedPlan:
         if not len(found.actions):
             raise PolicyError("all objects are at their goals already.")
         return PlanRest(found.actions, found.states).decision()
-
-    def _holds(self, rest: PlanRest, state: np.ndarray) -> bool:
-        """Whether the rest of a plan can be executed from the state."""
-        return bool(
-            len(rest.actions)
-            and deviation(state, rest.states[0]) <= self._tolerance
-            and allowed_actions(state, rest.actions[:1]).all()
-        )
-
-
-def deviation(state: np.ndarray, expected: np.ndarray) -> float:
-    """How far the body that is farthest off is from where it is expected, m.
-
-    An object counts by its position; how it is turned matters little to where it is
-    pushed.  The hand counts by its position or, by how far its heading takes a
-    fingertip astray.
-
-    Args:
-        state: Shape (3 + 3 m,).
-        expected: Shape (3 + 3 m,).
-    """
-    objects = np.linalg.norm(
-        object_positions(state) - object_positions(expected), axis=-1
-    )
-    hand = np.linalg.norm(state[:2] - expected[:2])
-    heading = _FINGERTIP * abs(state[2] - expected[2])
-    return float(max(hand, heading, objects.max()))

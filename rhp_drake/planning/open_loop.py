@@ -1,12 +1,12 @@
 """KDP as a policy: the kinodynamic RRT's plan, executed open loop."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from rhp_drake.planning.kinodynamic_rrt import plan
+from rhp_drake.planning.plan_rest import PlanRest
 from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.planning.search import Plan
 from rhp_drake.push_model.transition import PushModel
@@ -14,28 +14,6 @@ from rhp_drake.push_model.transition import PushModel
 # Plans with a push model, state, goals, generator and time_limit (by name), as
 # `kinodynamic_rrt.plan` does.
 Planner: TypeAlias = Callable[..., Plan]
-
-
-@dataclass(frozen=True)
-class PlanRest:
-    """What is left of a plan: the memory of policies that execute one.
-
-    Attributes:
-        actions: Shape (L,).
-        states: Where the plan expects to be before each action and at the end, shape
-            (L + 1, 3 + 3 m).
-    """
-
-    actions: np.ndarray
-    states: np.ndarray
-
-    def decision(self) -> Decision:
-        """The next action, of L > 0; the plan's rest is its one roll-out."""
-        value = -float(len(self.actions))
-        rest = PlanRest(self.actions[1:], self.states[1:])
-        return Decision(
-            int(self.actions[0]), value, self.states[None], np.array([value]), rest
-        )
 
 
 class OpenLoop:

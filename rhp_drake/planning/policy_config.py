@@ -24,12 +24,14 @@ class RecedingHorizonConfig:
         horizon: h, at least 1.
         temperature: tau > 0 of the soft-max, in actions.
         q_network: File of the weights.
+        rescue: Whether a plan takes over in a state that RHP has been in before.
     """
 
     num_roll_outs: int = 6
     horizon: int = 6
     temperature: float = 0.5
     q_network: str = DEFAULT_Q_NETWORK
+    rescue: bool = False
 
     def validate(self) -> None:
         """Raises an `InputError` that names the first impossible value."""
@@ -51,9 +53,11 @@ class GreedyConfig:
 
     Attributes:
         q_network: File of the weights.
+        rescue: Whether a plan takes over in a state that GP has been in before.
     """
 
     q_network: str = DEFAULT_Q_NETWORK
+    rescue: bool = False
 
     def validate(self) -> None:
         """Nothing can be impossible."""
@@ -110,13 +114,19 @@ PolicyConfig: TypeAlias = (
     RecedingHorizonConfig | GreedyConfig | OpenLoopConfig | CheckedPlanConfig
 )
 
-# Policies by short names: those of the paper's Table I, and KDP that looks.
+# Policies by short names: those of the paper's Table I, KDP that looks,
+# and policies that are got out of loops.
 POLICIES: Final[dict[str, Callable[[], PolicyConfig]]] = {
     "kdp": OpenLoopConfig,
     "gp": GreedyConfig,
     "rhp33": partial(RecedingHorizonConfig, num_roll_outs=3, horizon=3),
     "rhp66": partial(RecedingHorizonConfig, num_roll_outs=6, horizon=6),
     "kdp_checked": CheckedPlanConfig,
+    "gp_rescue": partial(GreedyConfig, rescue=True),
+    "rhp33_rescue": partial(
+        RecedingHorizonConfig, num_roll_outs=3, horizon=3, rescue=True
+    ),
+    "rhp66_rescue": partial(RecedingHorizonConfig, rescue=True),
 }
 
 
@@ -142,6 +152,7 @@ def MakePolicy(
     from rhp_drake.planning.kinodynamic_rrt import plan
     from rhp_drake.planning.open_loop import OpenLoop
     from rhp_drake.planning.receding_horizon import RecedingHorizon
+    from rhp_drake.planning.rescue import Rescued
     from rhp_drake.push_model.transition import PushModel
     from rhp_drake.resources import resolve
     from rhp_drake.value.q_network import load_q_network
@@ -161,11 +172,13 @@ def MakePolicy(
     q_network = load_q_network(resolve(config.q_network), num_objects)
     push_model = PushModel(num_objects, num_threads)
     if isinstance(config, GreedyConfig):
-        return RecedingHorizon(push_model, q_network, 0, 0, 1.0)
-    return RecedingHorizon(
-        push_model,
-        q_network,
-        config.num_roll_outs,
-        config.horizon,
-        config.temperature,
-    )
+        policy = RecedingHorizon(push_model, q_network, 0, 0, 1.0)
+    else:
+        policy = RecedingHorizon(
+            push_model,
+            q_network,
+            config.num_roll_outs,
+            config.horizon,
+            config.temperature,
+        )
+    return Rescued(policy, push_model, q_network) if config.rescue else policy

@@ -193,10 +193,16 @@ class Nodes:
         return self._actions[path[1:]], self._states[path]
 
 
-def _key(state: np.ndarray) -> np.ndarray:
-    key = state.copy()
-    key[2::3] *= _ANGLE_LENGTH
-    return key
+def near_any(state: np.ndarray, states: np.ndarray) -> bool:
+    """Whether a state (3 + 3 m,) is nearly one of the states (N, 3 + 3 m)."""
+    distances = np.abs(_key(states) - _key(state)).max(axis=1)
+    return bool((distances < _DUPLICATE_DISTANCE).any())
+
+
+def _key(states: np.ndarray) -> np.ndarray:
+    keys = states.copy()
+    keys[..., 2::3] *= _ANGLE_LENGTH
+    return keys
 
 
 def hopeless(states: np.ndarray, goals: np.ndarray) -> np.ndarray:
