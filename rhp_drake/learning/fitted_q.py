@@ -56,7 +56,7 @@ class FittedQConfig:
 
     discount: float = 1.0
     l2: float = 1e-6
-    learning_rate: float = 1e-3
+    learning_rate: float = 5e-4
     batch_size: int = 1024
     num_steps: int = 40_000
     target_rate: float = 0.005

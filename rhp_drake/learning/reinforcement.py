@@ -48,7 +48,7 @@ class Rounds:
         executed_only: Whether roll-outs and searches are not learned from.
     """
 
-    num_tasks: int = 100
+    num_tasks: int = 60
     num_steps: int = 1000
     epsilon: float = 0.1
     temperature: float = 0.5
