@@ -40,7 +40,8 @@ class _Memory:
 class Rescued:
     """Follows a policy, and a plan from a state in which the policy has been before.
 
-    The plan is executed while the scene is as it expects; then the policy goes on.
+    The plan is executed while the scene is as it expects.  Then the policy begins anew,
+    without what it remembered before.
 
     Args:
         policy: Decides in states that are new.
