@@ -45,8 +45,8 @@ def figure4(
 ) -> None:
     """Makes the paper's Figure 4: what the greedy policy learns from how many plans.
 
-    Trains a Q-network by imitation for each number of plans, and runs its greedy policy
-    on a frozen set of tasks.  Writes figure4.csv, figure4.svg and figure4.png.
+    Trains a Q-network for each number of plans, runs its greedy policy on frozen
+    tasks, and writes figure4.csv, figure4.svg and figure4.png.
 
     You may stop this at any moment: the same command goes on where it was.
     """
@@ -70,6 +70,9 @@ def figure4(
     )
     making = work.make_points(points, workers)
     console = Console(highlight=False, soft_wrap=True)
+    console.print(
+        f"{len(points)} trainings of {steps} steps; of each a line when it is done."
+    )
     results: list[PointResult] = []
     try:
         with make_progress(console) as progress:
