@@ -7,6 +7,7 @@ import typer
 from rhp_drake.commands.bench import bench
 from rhp_drake.commands.demos import demos
 from rhp_drake.commands.evaluate import evaluate
+from rhp_drake.commands.figure4 import figure4
 from rhp_drake.commands.learn import imitate, reinforce
 from rhp_drake.commands.plan import plan
 from rhp_drake.commands.run import run
@@ -18,7 +19,7 @@ app = typer.Typer(
     # A traceback is for developers; it need not fill the screen with variables.
     pretty_exceptions_show_locals=False,
 )
-for command in (run, plan, imitate, reinforce, evaluate):
+for command in (run, plan, imitate, reinforce, evaluate, figure4):
     app.command()(command)
 app.add_typer(demos, name="demos")
 app.add_typer(bench, name="bench")

@@ -9,7 +9,10 @@ import pytest
 from rhp_drake import cli
 from rhp_drake.value.q_network import QNetwork
 
-COMMANDS = ("run", "plan", "demos", "imitate", "reinforce", "evaluate", "bench")
+COMMANDS = (
+    *("run", "plan", "demos", "imitate", "reinforce", "evaluate", "figure4"),
+    "bench",
+)
 
 
 def rhp(monkeypatch, *arguments) -> int:
@@ -29,7 +32,8 @@ def test_help_needs_neither_drake_nor_torch():
         "try:\n"
         "    cli.main()\n"
         "except SystemExit:\n"
-        "    print('imported', sorted({'pydrake', 'torch', 'scipy'} & {*sys.modules}))"
+        "    heavy = {'pydrake', 'torch', 'scipy', 'matplotlib'}\n"
+        "    print('imported', sorted(heavy & {*sys.modules}))"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True

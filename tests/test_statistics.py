@@ -5,6 +5,7 @@ from rhp_drake.evaluation.machine import describe_machine
 from rhp_drake.evaluation.statistics import (
     bootstrap_interval,
     format_rate,
+    t_interval,
     wilson_interval,
 )
 from rhp_drake.random_streams import stream
@@ -31,6 +32,12 @@ def test_rate_of_nothing_can_be_anything():
 
 def test_format_rate():
     assert format_rate(81, 263) == "30.8 (25.5-36.6)"
+
+
+def test_t_interval_by_hand():
+    # Mean 2, standard error 1 / sqrt(3), quantile 4.303 for two degrees of freedom.
+    assert t_interval([1, 2, 3]) == pytest.approx((-0.484, 4.484), abs=1e-3)
+    assert t_interval([0.5, 0.5]) == (0.5, 0.5)
 
 
 def test_bootstrap_of_independent_values_is_that_of_normal_theory():

@@ -25,7 +25,7 @@ STATION: Final = "station"
 WORLDS: Final = (PLANAR, STATION)
 
 # Table I of the paper: success in % after imitation alone, by policy and uncertainty.
-_PAPER_SUCCESS: Final = {
+PAPER_SUCCESS: Final = {
     "kdp": {"none": 98.0, "low": 24.5, "medium": 28.5, "high": 15.7},
     "gp": {"none": 48.0, "low": 48.2, "medium": 42.2, "high": 44.7},
     "rhp33": {"none": 78.0, "low": 77.2, "medium": 73.4, "high": 71.5},
@@ -166,7 +166,7 @@ def make_table(results: _Results, title: str) -> Table:
         p50, p95 = 1e3 * np.percentile(seconds or [np.nan], [50, 95])
         row = [
             format_rate(len(successes), len(episodes)),
-            str(_PAPER_SUCCESS.get(policy, {}).get(level, "")),
+            str(PAPER_SUCCESS.get(policy, {}).get(level, "")),
             f"{_mean([e.num_actions for e in successes]):.1f}",
             f"{_format_ms(p50)} / {_format_ms(p95)}",
             f"{_mean([sum(e.decision_seconds) for e in successes]):.2f}",

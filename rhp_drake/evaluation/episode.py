@@ -1,5 +1,6 @@
 """One closed-loop run of a policy in the planar world."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 import time
 from typing import Protocol
@@ -8,9 +9,11 @@ import numpy as np
 
 from rhp_drake.physics import ObjectPhysics
 from rhp_drake.planning.policy import Policy, PolicyError
+from rhp_drake.planning.receding_horizon import RecedingHorizon
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import MAX_ACTIONS, TaskInstance, goals_reached, objects_fallen
+from rhp_drake.value.q_network import QNetwork
 
 
 class PlanarWorld(Protocol):
@@ -97,3 +100,15 @@ def run_episode(
         if goals_reached(state, goals):
             return Episode("succeeded", k + 1, seconds)
     return Episode("out of actions", MAX_ACTIONS, seconds)
+
+
+def greedy_episodes(
+    network: QNetwork, instances: Sequence[TaskInstance]
+) -> list[Episode]:
+    """Runs the greedy policy of a Q-network on each instance, in the push model."""
+    world = PushModel(network.num_objects)
+    policy = RecedingHorizon(world, network, 0, 0, 1.0)
+    return [
+        run_episode(world, policy, instance, 0, index)
+        for index, instance in enumerate(instances)
+    ]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import binomtest
+from scipy.stats import binomtest, t
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -18,6 +18,19 @@ def format_rate(successes: int, trials: int) -> str:
     """A success rate in percent with its Wilson interval, e.g. ``88.0 (84.9-90.6)``."""
     low, high = wilson_interval(successes, trials)
     return f"{100 * successes / trials:.1f} ({100 * low:.1f}-{100 * high:.1f})"
+
+
+def t_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    """95 % confidence interval of the mean of at least two values, by Student's t.
+
+    The mean plus and minus the standard error times the 97.5 % quantile of the t
+    distribution, of one degree of freedom less than there are values.
+    """
+    count = len(values)
+    standard_error = np.std(values, ddof=1) / np.sqrt(count)
+    half_width = t.ppf(0.975, count - 1) * standard_error
+    mean = np.mean(values)
+    return float(mean - half_width), float(mean + half_width)
 
 
 def bootstrap_interval(

@@ -2,10 +2,8 @@
 
 from typing import Final
 
-from rhp_drake.evaluation.episode import run_episode
+from rhp_drake.evaluation.episode import greedy_episodes
 from rhp_drake.frozen_instances import load_instances
-from rhp_drake.planning.receding_horizon import RecedingHorizon
-from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION
 from rhp_drake.value.q_network import QNetwork
 
@@ -20,10 +18,5 @@ def greedy_successes(network: QNetwork) -> tuple[int, int]:
     instances = load_instances(VALIDATION)[:_NUM_TASKS]
     if network.num_objects != instances[0].num_objects:
         return 0, 0
-    world = PushModel(network.num_objects)
-    policy = RecedingHorizon(world, network, 0, 0, 1.0)
-    episodes = [
-        run_episode(world, policy, instance, 0, index)
-        for index, instance in enumerate(instances)
-    ]
+    episodes = greedy_episodes(network, instances)
     return sum(episode.succeeded for episode in episodes), len(instances)

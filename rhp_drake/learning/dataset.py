@@ -165,3 +165,17 @@ def concatenate(parts: Sequence[Dataset]) -> Dataset:
             ]
         arrays[field.name] = np.concatenate(values)
     return Dataset(**arrays)
+
+
+def first_plans(dataset: Dataset, num_plans: int) -> Dataset:
+    """The same tasks and searches, with the first so many of the plans alone."""
+    solved = dataset.solved & (np.cumsum(dataset.solved) <= num_plans)
+    kept = solved[dataset.plan_tasks]
+    return replace(
+        dataset,
+        solved=solved,
+        plan_tasks=dataset.plan_tasks[kept],
+        plan_states=dataset.plan_states[kept],
+        plan_actions=dataset.plan_actions[kept],
+        plan_actions_left=dataset.plan_actions_left[kept],
+    )

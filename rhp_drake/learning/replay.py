@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
@@ -29,6 +30,9 @@ from rhp_drake.planning.search import chain
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.task import goals_reached
 from rhp_drake.workers import run_over
+
+# Those that come with the package, in compact form.
+SHIPPED_PLANS: Final = Path(__file__).resolve().parent.parent / "data/plans.parquet"
 
 
 @dataclass(frozen=True)

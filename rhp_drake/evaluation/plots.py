@@ -1,0 +1,102 @@
+"""Pictures of results."""
+
+from collections.abc import Sequence
+import io
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from rhp_drake.evaluation.comparison import PAPER_SUCCESS
+from rhp_drake.evaluation.figure4_data import NUM_BATCHES, CurvePoint
+from rhp_drake.files import write_atomically
+from rhp_drake.frozen_instances import SET_SIZE
+
+_STYLE: Final[dict[Any, Any]] = {
+    "font.size": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "0.4",
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": "0.9",
+    "xtick.color": "0.25",
+    "ytick.color": "0.25",
+    "legend.frameon": False,
+    # The same numbers make the same file.
+    "svg.hashsalt": "rhp_drake",
+}
+_OURS: Final = "#0a6e8a"
+_PAPER: Final = "#b5540f"
+# The end of the paper's curve: plans, and success in %.
+_PAPER_PLANS: Final = 9000
+_PAPER_PERCENT: Final = PAPER_SUCCESS["gp"]["none"]
+
+
+def draw_figure4(points: Sequence[CurvePoint]) -> Figure:
+    """Success by number of plans, and where the paper's curve ends."""
+    plans = [point.num_plans for point in points]
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(6.8, 4.2), layout="constrained")
+        axes = figure.add_subplot()
+        axes.set_xlabel("number of plans imitated")
+        axes.set_ylabel("tasks solved by the greedy policy (%)")
+        axes.set_xlim(0, 1.04 * max(_PAPER_PLANS, *plans))
+        axes.set_ylim(0, 100)
+        axes.axhline(_PAPER_PERCENT, color=_PAPER, linestyle=(0, (4, 4)), linewidth=1)
+        # The last point may lie on the axes' edge: none is clipped.
+        axes.plot(_PAPER_PLANS, _PAPER_PERCENT, "D", color=_PAPER, clip_on=False)
+        axes.annotate(
+            f"the paper, on its own tasks: {_PAPER_PERCENT:.0f} % "
+            f"with {_PAPER_PLANS} plans",
+            (_PAPER_PLANS, _PAPER_PERCENT),
+            xytext=(0, -9),
+            textcoords="offset points",
+            color=_PAPER,
+            horizontalalignment="right",
+            verticalalignment="top",
+        )
+        axes.fill_between(
+            plans,
+            [100 * point.low for point in points],
+            [100 * point.high for point in points],
+            color=_OURS,
+            alpha=0.18,
+            linewidth=0,
+            label=f"95 % confidence interval (t, {NUM_BATCHES} batches of "
+            f"{SET_SIZE // NUM_BATCHES} tasks)",
+        )
+        several = any(len(point.seed_rates) > 1 for point in points)
+        if several:
+            axes.plot(
+                [point.num_plans for point in points for _ in point.seed_rates],
+                [100 * rate for point in points for rate in point.seed_rates],
+                "_",
+                color=_OURS,
+                clip_on=False,
+                label="one training",
+            )
+        axes.plot(
+            plans,
+            [100 * point.success for point in points],
+            "-o",
+            color=_OURS,
+            linewidth=1.8,
+            markersize=5,
+            clip_on=False,
+            label="mean over trainings" if several else "this repository",
+        )
+        axes.legend(loc="lower right", reverse=True)
+    return figure
+
+
+def save_picture(figure: Figure, path: Path) -> None:
+    """Writes a picture as `path` with the suffixes .svg and .png."""
+    for name in ("svg", "png"):
+        picture = io.BytesIO()
+        metadata = {"Date": None} if name == "svg" else {}
+        with matplotlib.rc_context(_STYLE):
+            figure.savefig(picture, format=name, dpi=160, metadata=metadata)
+        write_atomically(path.with_suffix(f".{name}"), picture.getvalue())
