@@ -7,6 +7,7 @@ import typer
 from rhp_drake.commands.bench_action_frames import action_frames
 from rhp_drake.commands.bench_planners import planners
 from rhp_drake.commands.bench_push_model import push_model
+from rhp_drake.commands.bench_reinforcement import reinforcement
 
 # Drake is imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ def _bench() -> None:
 bench.command()(push_model)
 bench.command()(action_frames)
 bench.command()(planners)
+bench.command()(reinforcement)
 
 
 @bench.command()

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
+from rhp_drake.errors import WorkError
+
 # torch and Drake are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,6 +43,8 @@ def train_and_save(
 
     Raises:
         typer.Exit: With status 130 after Ctrl-C.
+        WorkError: If the loss is not finite, a worker dies, or nothing can be written;
+            the last checkpoint stays.
     """
     from rhp_drake.evaluation.validation import greedy_successes
     from rhp_drake.learning.demonstration_folder import describe
@@ -55,6 +59,11 @@ def train_and_save(
     except KeyboardInterrupt:
         console.print("Stopped; the same command goes on from its last checkpoint.")
         raise typer.Exit(130) from None
+    except OSError as error:
+        # Of TensorBoard; our own files have sentences of their own.
+        raise WorkError(
+            f"{error.filename or out}: cannot be written: {error.strerror}."
+        ) from error
     network = learner.network
     successes, trials = greedy_successes(network)
     network.provenance = {

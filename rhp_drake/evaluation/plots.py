@@ -1,6 +1,6 @@
 """Pictures of results."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import io
 from pathlib import Path
 from typing import Any, Final
@@ -89,6 +89,35 @@ def draw_figure4(points: Sequence[CurvePoint]) -> Figure:
             label="mean over trainings" if several else "this repository",
         )
         axes.legend(loc="lower right", reverse=True)
+    return figure
+
+
+def draw_learning_curves(
+    curves: Mapping[str, Sequence[tuple[Sequence[int], Sequence[float]]]],
+) -> Figure:
+    """Success of the greedy policy while it learns.
+
+    Args:
+        curves: For each method, by its name, a pair a seed: gradient steps, and the
+            share of tasks that is solved after them.
+    """
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(6.8, 4.2), layout="constrained")
+        axes = figure.add_subplot()
+        axes.set_xlabel("gradient steps")
+        axes.set_ylabel("validation tasks solved by the greedy policy (%)")
+        axes.set_ylim(0, 100)
+        for number, (name, of_seeds) in enumerate(curves.items()):
+            color = matplotlib.colormaps["tab20"](number % 20)
+            for k, (steps, rates) in enumerate(of_seeds):
+                axes.plot(
+                    steps,
+                    [100 * rate for rate in rates],
+                    color=color,
+                    linewidth=1.4,
+                    label=name.replace("_", " ") if k == 0 else None,
+                )
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 

@@ -63,7 +63,7 @@ class Reinforcement:
     """Feeds a learner with the experience that its own network makes.
 
     Args:
-        learner: With the demonstrations as its one source.
+        learner: With the demonstrations as its source, or without any.
         rounds: How.
         folder: Of the experience, a folder a round.
         seed: Of tasks and policy.
@@ -97,8 +97,14 @@ class Reinforcement:
         self._seed = seed
         self._workers = workers
         self._commit = commit
-        (self._demonstrations,) = learner.sources
+        self._demonstrations = list(learner.sources)
         self._experience: list[Dataset] = []
+
+    @property
+    def num_transitions(self) -> int:
+        """How many transitions of its experience have been learned from so far."""
+        self._read(-(-self._learner.num_steps // self.rounds.num_steps))
+        return sum(len(data.search_actions) for data in self._experience)
 
     def act(self) -> Iterator[int]:
         """Makes, or reads, the experience that the learner's next step needs.
@@ -109,15 +115,20 @@ class Reinforcement:
         index, steps = divmod(self._learner.num_steps, self.rounds.num_steps)
         if steps == 0:
             yield from self._act(index)
-        for known in range(len(self._experience), index + 1):
-            self._experience.append(load_dataset([self._round(known)]))
+        if self._read(index + 1):
             self._learner.sources = self._replay_buffer()
+
+    def _read(self, num_rounds: int) -> bool:
+        """Reads the experience of the first so many rounds; whether any was new."""
+        new = range(len(self._experience), num_rounds)
+        self._experience += [load_dataset([self._round(index)]) for index in new]
+        return len(new) > 0
 
     def _replay_buffer(self) -> list[Dataset]:
         experience = concatenate(self._experience)
         if not self.rounds.executed_only:
-            return [self._demonstrations, experience]
-        both = concatenate([self._demonstrations, experience])
+            return [*self._demonstrations, experience]
+        both = concatenate([*self._demonstrations, experience])
         return [without_oldest(both, len(experience.search_actions))]
 
     def _round(self, index: int) -> Path:

@@ -1,6 +1,6 @@
-"""How reinforcement learning is done: ours, the paper's, and what lies between."""
+"""How reinforcement learning is done: ours, the paper's, and ours less one thing."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from rhp_drake.learning.fitted_q import FittedQConfig
@@ -14,14 +14,16 @@ class Variant:
     Attributes:
         learning: How the network learns.
         rounds: How RHP acts.
+        from_scratch: Whether it begins with a random network and no demonstrations.
     """
 
     learning: FittedQConfig = field(default_factory=FittedQConfig)
     rounds: Rounds = field(default_factory=Rounds)
+    from_scratch: bool = False
 
 
 BEST: Final = Variant()
-# Section V: Q-learning without a target network, on executed transitions and plans,
+# Section V: Q-learning without a target network, on plans and what was executed,
 # squared errors, a gradient step for each action (an episode has some 16).
 PAPER: Final = Variant(
     learning=FittedQConfig(
@@ -31,13 +33,24 @@ PAPER: Final = Variant(
         double_q=False,
         squared_errors=True,
     ),
-    rounds=Rounds(
-        num_tasks=60,
-        num_steps=1000,
-        uncertainty="none",
-        num_searches=0,
-        executed_only=True,
-    ),
+    rounds=Rounds(uncertainty="none", num_searches=0, executed_only=True),
 )
-
-VARIANTS: Final = {"best": BEST, "paper": PAPER}
+_LEARNING: Final = BEST.learning
+_ROUNDS: Final = BEST.rounds
+VARIANTS: Final = {
+    "best": BEST,
+    "paper": PAPER,
+    "no_hindsight": replace(BEST, learning=replace(_LEARNING, hindsight=0.0)),
+    "no_search_returns": replace(
+        BEST, learning=replace(_LEARNING, search_returns=False)
+    ),
+    "no_double_q": replace(BEST, learning=replace(_LEARNING, double_q=False)),
+    "no_symmetry": replace(BEST, learning=replace(_LEARNING, symmetry=False)),
+    "nominal_physics": replace(BEST, rounds=replace(_ROUNDS, uncertainty="none")),
+    "no_searches": replace(BEST, rounds=replace(_ROUNDS, num_searches=0)),
+    "epsilon_greedy": replace(BEST, rounds=replace(_ROUNDS, horizon=0)),
+    "executed_only": replace(
+        BEST, rounds=replace(_ROUNDS, num_searches=0, executed_only=True)
+    ),
+    "from_scratch": replace(BEST, from_scratch=True),
+}

@@ -1,0 +1,205 @@
+"""Variants of reinforcement learning side by side, from the same start and plans.
+
+A folder holds `settings.json`, what all trainings have in common; `plans.parquet`, the
+plans that come with the package, with their states; and for each variant and seed the
+weights, whose provenance has the learning curve, once they are done.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+
+from rhp_drake.errors import InputError
+from rhp_drake.evaluation.episode import run_episode
+from rhp_drake.evaluation.validation import greedy_successes
+from rhp_drake.files import exclusive, write_atomically
+from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
+from rhp_drake.learning.dataset import load_dataset
+from rhp_drake.learning.fitted_q import FittedQ
+from rhp_drake.learning.reinforcement import Reinforcement
+from rhp_drake.learning.replay import SHIPPED_PLANS, rebuild
+from rhp_drake.learning.training import Stepped, make_repeatable, train
+from rhp_drake.learning.variants import VARIANTS
+from rhp_drake.planning.receding_horizon import RecedingHorizon
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.random_streams import VALIDATION, stream
+from rhp_drake.resources import resolve
+from rhp_drake.value.q_network import QNetwork, load_q_network
+from rhp_drake.workers import run_over
+
+START: Final = "package://rhp_drake/q_network/imitation.safetensors"
+_SETTINGS: Final = "settings.json"
+_PLANS: Final = "plans.parquet"
+# Gradient steps between points of a learning curve.
+_PERIOD: Final = 2000
+_NUM_TASKS: Final = 200
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training.
+
+    Attributes:
+        variant: Its name in `VARIANTS`.
+        seed: Of tasks, policy and batches.
+    """
+
+    variant: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What came of it, on the first `num_tasks` validation tasks.
+
+    Attributes:
+        training: Which one.
+        curve: Gradient steps, and how many tasks the greedy policy solved then.
+        rhp33: How many RHP-33 solves in the end.
+        num_tasks: Of how many.
+        num_transitions: Of RHP's acting that it learned from.
+    """
+
+    training: Training
+    curve: tuple[tuple[int, int], ...]
+    rhp33: int
+    num_tasks: int
+    num_transitions: int
+
+
+@dataclass(frozen=True)
+class Trainings:
+    """What the trainings of one folder have in common.
+
+    Attributes:
+        folder: Where the work is kept.
+        num_steps: Gradient steps of each.
+        commit: Of the code, to be noted.
+    """
+
+    folder: Path
+    num_steps: int
+    commit: str
+
+    def make(
+        self, trainings: Sequence[Training], num_workers: int
+    ) -> Iterator[TrainingResult]:
+        """Does what the folder lacks; killed at any moment, it goes on where it was.
+
+        Yields:
+            The results that were there, then each as it is done.
+
+        Raises:
+            InputError: If the folder was made with other settings.
+            WorkError: If a worker dies or a file cannot be written.
+        """
+        with exclusive(self.folder):
+            path = self.folder / _SETTINGS
+            settings = json.dumps(self._settings()) + "\n"
+            if path.exists() and path.read_text() != settings:
+                raise InputError(
+                    f"{self.folder}: was made with other settings; choose another one."
+                )
+            write_atomically(path, settings)
+            if not (self.folder / _PLANS).exists():
+                rebuild(SHIPPED_PLANS, self.folder / _PLANS)
+            missing = []
+            for training in trainings:
+                if self.weights_path(training).exists():
+                    yield self._read(training)
+                else:
+                    missing.append(training)
+            for _, result in run_over(
+                partial(_train, trainings=self), missing, num_workers
+            ):
+                yield result
+
+    def weights_path(self, training: Training) -> Path:
+        """Where the weights of a training are once it is done."""
+        return self.folder / f"{training.variant}_{training.seed}.safetensors"
+
+    def plans_path(self) -> Path:
+        """Of the plans with their states."""
+        return self.folder / _PLANS
+
+    def _settings(self) -> dict[str, Any]:
+        start = repr(load_q_network(resolve(START), NUM_OBJECTS))
+        return {"num_steps": self.num_steps, "start": start}
+
+    def _read(self, training: Training) -> TrainingResult:
+        path = self.weights_path(training)
+        noted = load_q_network(path, NUM_OBJECTS).provenance
+        return TrainingResult(
+            training,
+            tuple((step, successes) for step, successes in noted["curve"]),
+            noted["rhp33"],
+            noted["num_tasks"],
+            noted["num_transitions"],
+        )
+
+
+def _train(training: Training, trainings: Trainings) -> TrainingResult:
+    """Trains, evaluates, and writes the weights."""
+    make_repeatable(training.seed)
+    variant = VARIANTS[training.variant]
+    if variant.from_scratch:
+        network, sources = QNetwork(NUM_OBJECTS), []
+    else:
+        network = load_q_network(resolve(START), NUM_OBJECTS)
+        sources = [load_dataset([trainings.plans_path()])]
+    config = replace(variant.learning, num_steps=trainings.num_steps)
+    learner = FittedQ(network, sources, config, stream(training.seed, "reinforcement"))
+    path = trainings.weights_path(training)
+    reinforcement = Reinforcement(
+        learner,
+        variant.rounds,
+        path.with_suffix(".rounds"),
+        training.seed,
+        1,
+        trainings.commit,
+    )
+    checkpoint = path.with_suffix(".checkpoint")
+    curve_path = path.with_suffix(".curve.json")
+    curve = json.loads(curve_path.read_text()) if curve_path.exists() else {}
+    for event in train(learner, checkpoint, asdict(variant.rounds), reinforcement):
+        if isinstance(event, Stepped) and event.num_steps % _PERIOD == 0:
+            # Steps that are taken again after a stop have the same successes.
+            curve[str(event.num_steps)], _ = greedy_successes(network)
+            write_atomically(curve_path, json.dumps(curve))
+    # Physics are computed as everywhere else.
+    torch.set_flush_denormal(False)
+    result = TrainingResult(
+        training,
+        tuple((int(step), successes) for step, successes in curve.items()),
+        _rhp33_successes(network),
+        _NUM_TASKS,
+        reinforcement.num_transitions,
+    )
+    network.provenance = {
+        "commit": trainings.commit,
+        **asdict(training),
+        **asdict(variant.rounds),
+        **asdict(config),
+        "curve": result.curve,
+        "rhp33": result.rhp33,
+        "num_tasks": result.num_tasks,
+        "num_transitions": result.num_transitions,
+    }
+    network.save(path)
+    checkpoint.unlink(missing_ok=True)
+    curve_path.unlink(missing_ok=True)
+    return result
+
+
+def _rhp33_successes(network: QNetwork) -> int:
+    world = PushModel(NUM_OBJECTS)
+    policy = RecedingHorizon(world, network, 3, 3, 0.5)
+    return sum(
+        run_episode(world, policy, instance, 0, index).succeeded
+        for index, instance in enumerate(load_instances(VALIDATION)[:_NUM_TASKS])
+    )

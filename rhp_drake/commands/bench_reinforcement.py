@@ -1,0 +1,121 @@
+"""`rhp bench reinforcement`: what each part of the learning method is worth."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rhp_drake.errors import InputError
+
+# torch, Drake and matplotlib are imported in the functions, so that `rhp --help` is
+# quick.
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.table import Table
+
+    from rhp_drake.benchmarks.reinforcement import TrainingResult
+
+_VARIANTS = (
+    "best,paper,no_hindsight,no_search_returns,no_double_q,no_symmetry,"
+    "nominal_physics,no_searches,epsilon_greedy,executed_only,from_scratch"
+)
+
+
+def reinforcement(
+    *,
+    out: Annotated[
+        Path, typer.Option(help="Folder of weights, learning curves and pictures.")
+    ],
+    variants: Annotated[str, typer.Option(help="Any of the default ones.")] = _VARIANTS,
+    seeds: Annotated[int, typer.Option(min=1, help="Trainings of each.")] = 3,
+    steps: Annotated[
+        int, typer.Option(min=1000, help="Gradient steps of a training.")
+    ] = 10_000,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+) -> None:
+    """Trains variants of the method from the same start, and compares them.
+
+    All see validation tasks only. You may stop this at any moment: the same command
+    goes on where it was.
+    """
+    from rich.console import Console
+
+    from rhp_drake.benchmarks.reinforcement import Training, Trainings
+    from rhp_drake.commands.progress import make_progress
+    from rhp_drake.evaluation.machine import describe_machine
+    from rhp_drake.evaluation.plots import draw_learning_curves, save_picture
+    from rhp_drake.learning.variants import VARIANTS
+    from rhp_drake.run_record import source_commit
+
+    names = list(dict.fromkeys(variants.split(",")))
+    for name in names:
+        if name not in VARIANTS:
+            raise InputError(
+                f"--variants: {name!r} is not one of {', '.join(VARIANTS)}."
+            )
+    wanted = [Training(name, seed) for seed in range(seeds) for name in names]
+    console = Console(highlight=False, soft_wrap=True)
+    results: list[TrainingResult] = []
+    try:
+        with make_progress(console) as progress:
+            bar = progress.add_task("Trainings", total=len(wanted))
+            work = Trainings(out, steps, source_commit())
+            for result in work.make(wanted, workers):
+                results.append(result)
+                progress.advance(bar)
+    except KeyboardInterrupt:
+        console.print("Stopped; the same command goes on from here.")
+        raise typer.Exit(130) from None
+    # Sorted: the order in which workers finish means nothing.
+    by_variant = {
+        name: sorted(
+            (r for r in results if r.training.variant == name),
+            key=lambda result: result.training.seed,
+        )
+        for name in names
+    }
+    curves = {
+        name: [
+            ([step for step, _ in r.curve], [n / r.num_tasks for _, n in r.curve])
+            for r in of_variant
+        ]
+        for name, of_variant in by_variant.items()
+    }
+    save_picture(draw_learning_curves(curves), out / "learning_curves")
+    console.print(_table(by_variant, steps))
+    console.print(f"{out}: learning_curves.svg, learning_curves.png, weights")
+    console.print(describe_machine(workers))
+
+
+def _table(by_variant: "dict[str, list[TrainingResult]]", steps: int) -> "Table":
+    """Success of all seeds together, and of each."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from rhp_drake.evaluation.statistics import format_rate
+
+    def cells(successes: "Sequence[int]", num_tasks: int) -> list[str]:
+        return [
+            format_rate(sum(successes), num_tasks * len(successes)),
+            ", ".join(f"{100 * number / num_tasks:.1f}" for number in successes),
+        ]
+
+    table = Table(
+        title=f"After {steps} steps, % of validation tasks (95 % Wilson)",
+        box=SIMPLE_HEAD,
+        title_justify="left",
+    )
+    table.add_column("variant", no_wrap=True)
+    for heading in ("GP", "by seed", "RHP-33", "by seed", "transitions"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, results in by_variant.items():
+        num_tasks = results[0].num_tasks
+        transitions = sum(r.num_transitions for r in results) / len(results)
+        table.add_row(
+            name,
+            *cells([r.curve[-1][1] if r.curve else 0 for r in results], num_tasks),
+            *cells([r.rhp33 for r in results], num_tasks),
+            f"{transitions:.0f}",
+        )
+    return table

@@ -1,0 +1,197 @@
+"""`rhp imitate`, `rhp reinforce` and `rhp bench reinforcement`, also interrupted."""
+
+import errno
+import resource
+
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from rhp_drake import cli
+from rhp_drake.benchmarks import reinforcement as bench
+from rhp_drake.benchmarks.reinforcement import Training, Trainings
+from rhp_drake.commands import training as commands
+from rhp_drake.errors import InputError
+from rhp_drake.evaluation import validation
+from rhp_drake.learning import training
+from rhp_drake.learning.demonstration_files import write_table
+from rhp_drake.learning.fitted_q import FittedQConfig
+from rhp_drake.learning.imitation import Imitation
+from rhp_drake.learning.learner import Learner
+from rhp_drake.learning.reinforcement import Rounds
+from rhp_drake.learning.replay import SHIPPED_PLANS, rebuild
+from rhp_drake.learning.variants import VARIANTS, Variant
+from rhp_drake.value.q_network import QNetwork, load_q_network
+
+STEPS = 8
+
+
+def rhp(monkeypatch, *arguments) -> int:
+    """Runs the command line in this process, and returns its exit status."""
+    monkeypatch.setattr("sys.argv", ["rhp", *map(str, arguments)])
+    with pytest.raises(SystemExit) as info:
+        cli.main()
+    return info.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def plans(tmp_path_factory):
+    """Five plans with states."""
+    folder = tmp_path_factory.mktemp("plans")
+    write_table(folder / "few.parquet", pq.read_table(SHIPPED_PLANS).slice(0, 5))
+    rebuild(folder / "few.parquet", folder / "plans.parquet")
+    return folder / "plans.parquet"
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """A few validation tasks, and checkpoints, logs and validations every few steps."""
+    monkeypatch.setattr(validation, "_NUM_TASKS", 2)
+    monkeypatch.setattr(training, "_CHECKPOINT_PERIOD", 2)
+    monkeypatch.setattr(commands, "_LOG_PERIOD", 2)
+    monkeypatch.setattr(commands, "_VALIDATION_PERIOD", 4)
+    yield
+    torch.set_flush_denormal(False)
+
+
+def imitate(monkeypatch, plans, out) -> int:
+    options = ("--demonstrations", plans, "--out", out, "--steps", STEPS)
+    return rhp(monkeypatch, "imitate", *options)
+
+
+def same_weights(one, other) -> bool:
+    ours, theirs = (load_q_network(path, 3).state_dict() for path in (one, other))
+    return all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_imitate_writes_weights_that_say_where_they_come_from(
+    plans, monkeypatch, capsys, tmp_path
+):
+    out = tmp_path / "weights.safetensors"
+    assert imitate(monkeypatch, plans, out) == 0
+    assert "greedily solves" in capsys.readouterr().out
+    provenance = load_q_network(out, 3).provenance
+    assert provenance["command"].startswith("rhp imitate --demonstrations")
+    assert provenance["num_steps"] == STEPS
+    assert provenance["validation_successes_of_gp"].endswith(" of 2")
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"weights.safetensors", "weights.safetensors.logs"}
+
+
+def interrupted(monkeypatch, at, error):
+    """Makes the learner's next steps up to `at`, then raises the error, once."""
+    whole_step = Learner.step
+
+    def step(self):
+        if self.num_steps == at:
+            monkeypatch.setattr(Imitation, "step", whole_step)
+            raise error
+        whole_step(self)
+
+    monkeypatch.setattr(Imitation, "step", step)
+
+
+def test_ctrl_c_loses_nothing(plans, monkeypatch, capsys, tmp_path):
+    straight, stopped = tmp_path / "straight", tmp_path / "stopped"
+    assert imitate(monkeypatch, plans, straight) == 0
+    interrupted(monkeypatch, 5, KeyboardInterrupt())
+    assert imitate(monkeypatch, plans, stopped) == 130
+    assert "goes on from its last checkpoint" in capsys.readouterr().out
+    assert not stopped.exists()
+    assert imitate(monkeypatch, plans, stopped) == 0
+    assert "Goes on from step 4" in capsys.readouterr().out
+    assert same_weights(straight, stopped)
+
+
+def test_a_bad_loss_stops_training_with_a_sentence(
+    plans, monkeypatch, capsys, tmp_path
+):
+    out = tmp_path / "weights"
+    whole_loss = Imitation._loss
+    monkeypatch.setattr(
+        Imitation,
+        "_loss",
+        lambda self: whole_loss(self) * (torch.nan if self.num_steps == 3 else 1),
+    )
+    assert imitate(monkeypatch, plans, out) == 1
+    assert "rhp: the loss of step 3 is nan." in capsys.readouterr().err
+    assert not out.exists()
+    assert (tmp_path / "weights.checkpoint").exists()
+
+
+# TensorBoard writes from a thread of its own.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("limit", [100_000, 10], ids=["checkpoint", "logs"])
+def test_a_full_disk_loses_nothing(limit, plans, monkeypatch, capsys, tmp_path):
+    """A file that may not grow: to a program it is a full disk."""
+    straight, stopped = tmp_path / "straight", tmp_path / "stopped"
+    assert imitate(monkeypatch, plans, straight) == 0
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
+    try:
+        status = imitate(monkeypatch, plans, stopped)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert status == 1
+    assert "cannot be written" in capsys.readouterr().err
+    assert imitate(monkeypatch, plans, stopped) == 0
+    assert same_weights(straight, stopped)
+
+
+def test_reinforce_refuses_what_cannot_be(plans, monkeypatch, capsys, tmp_path):
+    start = tmp_path / "start.safetensors"
+    QNetwork(3).save(start)
+    options = ("--demonstrations", plans, "--start", start, "--out", tmp_path / "w")
+    assert rhp(monkeypatch, "reinforce", *options, "--variant", "worst") == 2
+    assert "'worst' is neither best nor paper." in capsys.readouterr().err
+    assert rhp(monkeypatch, "reinforce", *options, "--steps", "1500") == 2
+    assert "1500 steps are no whole number of rounds" in capsys.readouterr().err
+
+
+@pytest.fixture
+def tiny_variants(plans, monkeypatch):
+    """All variants, with rounds of two tasks and four steps; few plans."""
+    for name, variant in VARIANTS.items():
+        rounds = {**vars(variant.rounds), "num_tasks": 2, "num_steps": 4}
+        learning = {**vars(variant.learning), "batch_size": 16}
+        monkeypatch.setitem(
+            VARIANTS,
+            name,
+            Variant(
+                learning=FittedQConfig(**learning),
+                rounds=Rounds(**rounds),
+                from_scratch=variant.from_scratch,
+            ),
+        )
+    monkeypatch.setattr(bench, "SHIPPED_PLANS", plans)
+    monkeypatch.setattr(bench, "_PERIOD", 4)
+    monkeypatch.setattr(bench, "_NUM_TASKS", 2)
+
+
+def test_variants_side_by_side(tiny_variants, monkeypatch, tmp_path):
+    names = ("best", "paper", "from_scratch")
+    wanted = [Training(name, 0) for name in names]
+    straight = Trainings(tmp_path / "straight", STEPS, "commit")
+    results = list(straight.make(wanted, 1))
+    assert [result.training for result in results] == wanted
+    for result in results:
+        assert [step for step, _ in result.curve] == [4, 8]
+        assert result.num_transitions > 0
+    # Roll-outs and searches count, beside what was executed.
+    assert results[0].num_transitions > 3 * results[1].num_transitions
+
+    # Again, stopped before the first is written.
+    folder = Trainings(tmp_path / "stopped", STEPS, "commit")
+    evaluate = bench._rhp33_successes
+    monkeypatch.setattr(bench, "_rhp33_successes", _fail)
+    with pytest.raises(OSError, match="No space"):
+        list(folder.make(wanted, 1))
+    monkeypatch.setattr(bench, "_rhp33_successes", evaluate)
+    assert list(folder.make(wanted, 1)) == results
+    assert list(folder.make(wanted, 1)) == results
+    with pytest.raises(InputError, match="made with other settings"):
+        list(Trainings(tmp_path / "straight", STEPS + 4, "commit").make(wanted, 1))
+
+
+def _fail(network):
+    raise OSError(errno.ENOSPC, "No space left on device")
