@@ -8,6 +8,9 @@ import typer
 from rhp_drake.errors import InputError
 from rhp_drake.planning.policy_config import POLICIES, PolicyConfig
 
+# So many failures are shown one by one; the file of --out has all.
+_NUM_ENDINGS = 10
+
 
 def evaluate(
     *,
@@ -46,6 +49,7 @@ def evaluate(
 
     from rhp_drake.evaluation.comparison import (
         Comparison,
+        make_ending_table,
         make_failure_table,
         make_table,
         run_comparison,
@@ -82,6 +86,7 @@ def evaluate(
     tables = [make_table(results, title)]
     if not all(episode.succeeded for _, episode in results):
         tables.append(make_failure_table(results))
+        tables.append(make_ending_table(results, _NUM_ENDINGS))
     for table in tables:
         console.print(table)
         console.print()

@@ -192,6 +192,26 @@ def make_failure_table(results: _Results) -> Table:
     return _table_by_policy(results, "Failures", headings, cells)
 
 
+def make_ending_table(results: _Results, count: int) -> Table:
+    """The first so many failures one by one."""
+    failures = [(t, e) for t, e in results if not e.succeeded]
+    title = "Failures one by one"
+    if len(failures) > count:
+        title = f"The first {count} failures of {len(failures)}"
+    table = Table(title=title, box=SIMPLE_HEAD, padding=0, show_edge=False)
+    for heading in ("policy", "level", "task", "cause", "ending"):
+        table.add_column(heading)
+    for trial, episode in failures[:count]:
+        table.add_row(
+            trial.policy,
+            trial.level,
+            str(trial.index),
+            episode.outcome,
+            episode.ending,
+        )
+    return table
+
+
 def _table_by_policy(
     results: _Results,
     title: str,

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from rhp_drake.evaluation.failure import describe_ending
 from rhp_drake.physics import ObjectPhysics
 from rhp_drake.planning.policy import Policy, PolicyError
 from rhp_drake.planning.receding_horizon import RecedingHorizon
@@ -52,6 +53,7 @@ class Episode:
         decision_seconds: Computation of each decision.
         simulated_seconds: How long it took in the world; 0 where time does not flow.
         world_seconds: Computation of the world.
+        ending: How it ended, in words, if it failed; see `failure.describe_ending`.
     """
 
     outcome: str
@@ -59,6 +61,7 @@ class Episode:
     decision_seconds: list[float] = field(default_factory=list)
     simulated_seconds: float = 0.0
     world_seconds: float = 0.0
+    ending: str = ""
 
     @property
     def succeeded(self) -> bool:
@@ -78,28 +81,34 @@ def run_episode(
         seed: Of the experiment.
         index: Of the instance; decision k draws from stream (index, "decision", k).
     """
-    state, goals = instance.initial_state, instance.goals
+    states, goals = [instance.initial_state], instance.goals
     memory = None
     seconds: list[float] = []
+
+    def failed(outcome: str, num_actions: int) -> Episode:
+        ending = describe_ending(states, goals)
+        return Episode(outcome, num_actions, seconds, ending=ending)
+
     for k in range(MAX_ACTIONS):
         begin = time.perf_counter()
         try:
             decision = policy.decide(
-                state, goals, stream(seed, index, "decision", k), memory
+                states[-1], goals, stream(seed, index, "decision", k), memory
             )
         except (PolicyError, PushModelError):
-            return Episode("policy failed", k, seconds)
+            return failed("policy failed", k)
         seconds.append(time.perf_counter() - begin)
         memory = decision.memory
         try:
-            state = world.step(state[None], np.array([decision.action]))[0]
+            state = world.step(states[-1][None], np.array([decision.action]))[0]
         except PushModelError:
-            return Episode("world failed", k + 1, seconds)
+            return failed("world failed", k + 1)
+        states.append(state)
         if objects_fallen(state):
-            return Episode("object fell", k + 1, seconds)
+            return failed("object fell", k + 1)
         if goals_reached(state, goals):
             return Episode("succeeded", k + 1, seconds)
-    return Episode("out of actions", MAX_ACTIONS, seconds)
+    return failed("out of actions", MAX_ACTIONS)
 
 
 def greedy_episodes(
