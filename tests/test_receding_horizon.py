@@ -9,6 +9,7 @@ from rhp_drake.planning.receding_horizon import (
     RecedingHorizon,
     sample_softmax,
 )
+from rhp_drake.push_model.transition import PushModelError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
     TABLE_UPPER,
@@ -182,3 +183,27 @@ def test_equal_pairs_are_simulated_once():
     for states in decision.roll_outs:
         moves = object_positions(states)[:, 0] - states[:, :2]
         np.testing.assert_allclose(moves, 0, atol=1e-12)
+
+
+class RefusingModel:
+    """A push model that refuses all states."""
+
+    def step(self, states, actions):
+        raise PushModelError("bodies deep inside each other.")
+
+
+def test_greedy_where_the_model_refuses_the_state():
+    values = Constant(-9, -99, -5, -99, -99, -99)
+    decision = rhp(values, model=RefusingModel()).decide(
+        STATE, goal_after(3), stream(0)
+    )
+    assert (decision.action, decision.value) == (2, -5)
+    assert not len(decision.roll_outs)
+
+
+def test_nothing_is_decided_in_a_state_that_is_not_finite():
+    state = STATE.copy()
+    state[4] = np.nan
+    for horizon in (0, 6):
+        with pytest.raises(PolicyError, match="the state is not finite"):
+            rhp(FORWARD, h=horizon).decide(state, goal_after(3), stream(0))

@@ -6,6 +6,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from rhp_drake.planning.policy import Decision, PolicyError
+from rhp_drake.push_model.transition import PushModelError
 from rhp_drake.task import (
     HAND_ACTIONS,
     MAX_ACTIONS,
@@ -73,7 +74,8 @@ class RecedingHorizon:
     roll-outs go forward together: one query of the value function and one batch of
     the push model a depth, in which equal (state, action) pairs are simulated once.
 
-    With h = 0 this is the greedy policy, GP.
+    With h = 0 this is the greedy policy, GP.  It also decides where the push model
+    refuses the state.
 
     Attributes:
         push_model: T, what the roll-outs are simulated in.
@@ -101,13 +103,30 @@ class RecedingHorizon:
         memory: Any = None,
     ) -> Decision:
         """The first action of the best roll-out; see `policy.Policy`."""
+        if not np.isfinite(state).all():
+            raise PolicyError("the state is not finite.")
         q = self._masked_values(state[None], goals)
         if not np.isfinite(q).any():
             raise PolicyError("no action keeps the hand in the workspace.")
+        best = int(q[0].argmax())
+        greedy = Decision(int(self.action_set[best]), float(q[0, best]))
         if self.horizon == 0:
-            best = int(q[0].argmax())
-            return Decision(int(self.action_set[best]), float(q[0, best]))
+            return greedy
+        try:
+            return self._look_ahead(state, goals, q, generator)
+        except PushModelError:
+            # Where objects are smaller than the model believes, they come so close that
+            # it sees them overlap.  To wait would not part them.
+            return greedy
 
+    def _look_ahead(
+        self,
+        state: np.ndarray,
+        goals: np.ndarray,
+        q: np.ndarray,
+        generator: np.random.Generator,
+    ) -> Decision:
+        """The first action of the best roll-out; `q` are the state's values (1, 6)."""
         n = self.num_roll_outs
         states = np.repeat(state[None], n, axis=0)
         path = [states]

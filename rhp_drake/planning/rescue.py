@@ -15,6 +15,7 @@ from rhp_drake.planning.plan_rest import PlanRest
 from rhp_drake.planning.policy import Decision, Policy
 from rhp_drake.planning.receding_horizon import TransitionFunction, ValueFunction
 from rhp_drake.planning.search import near_any
+from rhp_drake.push_model.transition import PushModelError
 
 # m: how far a body may be from where the rescue expects it, as for `CheckedPlan`.
 _TOLERANCE: Final = 0.01
@@ -74,6 +75,17 @@ class Rescued:
             decision = rest.decision()
             return _remember(decision, memory.visited, decision.memory, None)
         if near_any(state, memory.visited):
+            rest = self._plan(state, goals)
+            if rest is not None:
+                decision = rest.decision()
+                return _remember(decision, memory.visited, decision.memory, None)
+        decision = self._policy.decide(state, goals, generator, memory.of_policy)
+        visited = np.concatenate([memory.visited, state[None]])
+        return _remember(decision, visited, None, decision.memory)
+
+    def _plan(self, state: np.ndarray, goals: np.ndarray) -> PlanRest | None:
+        """A plan from the state, if one is found."""
+        try:
             found = plan_best_first(
                 self._push_model,
                 self._value_function,
@@ -81,12 +93,11 @@ class Rescued:
                 goals,
                 max_transitions=_MAX_TRANSITIONS,
             )
-            if found.actions is not None and len(found.actions):
-                decision = PlanRest(found.actions, found.states).decision()
-                return _remember(decision, memory.visited, decision.memory, None)
-        decision = self._policy.decide(state, goals, generator, memory.of_policy)
-        visited = np.concatenate([memory.visited, state[None]])
-        return _remember(decision, visited, None, decision.memory)
+        except PushModelError:
+            return None
+        if found.actions is None or not len(found.actions):
+            return None
+        return PlanRest(found.actions, found.states)
 
 
 def _remember(
