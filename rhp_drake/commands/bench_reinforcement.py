@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _VARIANTS = (
     "best,paper,no_hindsight,no_search_returns,no_double_q,no_symmetry,"
-    "nominal_physics,no_searches,epsilon_greedy,executed_only,from_scratch"
+    "uncertain_physics,no_searches,epsilon_greedy,executed_only,from_scratch"
 )
 
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from rhp_drake.learning.demonstration import Demonstration, training_task
-from rhp_drake.physics import ObjectPhysics, draw_physics
+from rhp_drake.physics import ObjectPhysics, draw_physics, nominal_physics
 from rhp_drake.planning.best_first import plan_best_first
 from rhp_drake.planning.kinodynamic_rrt import plan
 from rhp_drake.planning.policy import PolicyError
@@ -223,6 +223,7 @@ class _RecordingPushModel:
 
     def __init__(self, num_objects: int) -> None:
         self._push_model = PushModel(num_objects)
+        self._physics = nominal_physics(num_objects)
         self.forget()
 
     def forget(self) -> None:
@@ -239,8 +240,10 @@ class _RecordingPushModel:
     def execute(
         self, state: np.ndarray, action: int, physics: ObjectPhysics
     ) -> np.ndarray:
-        """The state after an action in a world of other physics."""
+        """The state after an action in a world of these physics."""
         actions = np.array([action])
+        if physics.key() == self._physics.key():
+            return self.step(state[None], actions)[0]
         child = self._push_model.step(state[None], actions, physics)[0]
         self._add(state, action, child)
         return child

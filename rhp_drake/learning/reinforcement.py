@@ -54,7 +54,7 @@ class Rounds:
     temperature: float = 0.5
     num_roll_outs: int = 6
     horizon: int = 6
-    uncertainty: str = "high"
+    uncertainty: str = "none"
     num_searches: int = 3
     executed_only: bool = False
 
