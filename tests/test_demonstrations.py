@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from rhp_drake.errors import InputError
-from rhp_drake.learning.dataset import load_dataset
+from rhp_drake.learning.dataset import _actions_left, load_dataset, without_oldest
 from rhp_drake.learning.demonstration import Demonstration, training_task
 from rhp_drake.learning.demonstration_files import about, lengths, read_table
 from rhp_drake.learning.demonstration_folder import (
@@ -31,7 +31,7 @@ from rhp_drake.learning.replay import compact, rebuild, verify
 from rhp_drake.planning.search import SearchRecord
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.resources import models_path
-from rhp_drake.task import goals_reached
+from rhp_drake.task import MAX_ACTIONS, goals_reached
 from rhp_drake.value.q_network import QNetwork, load_q_network
 
 DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
@@ -382,6 +382,64 @@ def test_rhp_demonstrates_with_all_its_roll_outs():
     np.testing.assert_array_equal(
         search.next_states[search.origins[linked]], search.states[linked]
     )
+
+
+def test_rhp_may_keep_what_was_executed_alone():
+    torch.manual_seed(0)
+    network = QNetwork(3)
+    whole = RecedingHorizonDemonstrator(11, network).demonstrate(2)
+    executed = RecedingHorizonDemonstrator(11, network, executed_only=True)
+    search = executed.demonstrate(2).search
+    assert 0 < len(search.actions) <= MAX_ACTIONS < len(whole.search.actions)
+    np.testing.assert_array_equal(search.origins, np.arange(len(search.actions)) - 1)
+    np.testing.assert_array_equal(search.next_states[:-1], search.states[1:])
+    # It acted alike.
+    np.testing.assert_array_equal(search.states[0], whole.instance.initial_state)
+    assert pairs_of(search) <= pairs_of(whole.search)
+
+
+def pairs_of(search):
+    """The states and actions that were simulated."""
+    return {
+        (state.tobytes(), int(action))
+        for state, action in zip(search.states, search.actions, strict=True)
+    }
+
+
+def test_rhp_may_act_in_physics_that_it_does_not_know_and_search_on_its_way():
+    network = load_q_network(models_path() / "q_network/best.safetensors", 3)
+    demonstrator = RecedingHorizonDemonstrator(
+        11, network, uncertainty="high", num_searches=2
+    )
+    made, again = (demonstrator.demonstrate(2) for _ in range(2))
+    equal(made, again)
+    search = made.search
+    nominal = PushModel(3).step(search.states, search.actions)
+    differs = ~np.isclose(nominal, search.next_states, atol=1e-9).all(axis=1)
+    # What was executed and touched something came out otherwise; roll-outs did not.
+    assert 0 < differs.sum() <= MAX_ACTIONS
+    without = RecedingHorizonDemonstrator(11, network, uncertainty="high")
+    assert len(without.demonstrate(2).search.actions) < len(search.actions)
+
+
+def test_actions_left_are_those_of_the_shortest_way():
+    # 0 -> 1 -> 2 (goal), 0 -> 3 (goal), and 4 leads nowhere.
+    origins = np.array([-1, 0, 1, 0, -1])
+    reached = np.array([False, False, True, True, False])
+    np.testing.assert_array_equal(_actions_left(reached, origins), [2, 2, 1, 1, 0])
+
+
+def test_the_oldest_transitions_go_first(folder):
+    data = load_dataset([folder])
+    rest = without_oldest(data, 10)
+    np.testing.assert_array_equal(rest.search_states, data.search_states[10:])
+    np.testing.assert_array_equal(rest.plan_states, data.plan_states)
+    linked = rest.search_origins >= 0
+    np.testing.assert_array_equal(
+        rest.search_next_states[rest.search_origins[linked]],
+        rest.search_states[linked],
+    )
+    assert (data.search_origins[10:][~linked] < 10).all()
 
 
 def test_the_guided_search_demonstrates():
