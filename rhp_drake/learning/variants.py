@@ -23,11 +23,13 @@ class Variant:
 
 
 BEST: Final = Variant()
-# Section V: Q-learning without a target network, on plans and what was executed,
-# squared errors, a gradient step for each action (an episode has some 16).
+# Section V: Q-learning on plans and on what was executed, squared errors, a gradient
+# step for each action (an episode has some 16).  The paper does not name its learning
+# rate; at `BEST`'s, and without a target network, greedy success fell from 70 to 35 %
+# of 200 validation tasks in 4000 steps.
 PAPER: Final = Variant(
     learning=FittedQConfig(
-        target_rate=1.0,
+        learning_rate=1e-4,
         hindsight=0.0,
         search_returns=False,
         double_q=False,
