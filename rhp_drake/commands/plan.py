@@ -26,18 +26,11 @@ if TYPE_CHECKING:
 
 
 def plan(
-    scenario: Annotated[
-        Path, typer.Argument(help="A scenario file, or the name of a bundled one.")
-    ],
+    scenario: task_run.ScenarioFile,
     *,
-    name: Annotated[
-        str | None, typer.Option(help="Which scenario, if the file has several.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
-    scenario_text: Annotated[
-        str | None,
-        typer.Option(help="YAML to merge into it, e.g. '{world_physics: high}'."),
-    ] = None,
+    name: task_run.ScenarioName = None,
+    seed: task_run.Seed = None,
+    scenario_text: task_run.ScenarioText = None,
     time_limit: Annotated[
         float | None,
         typer.Option(
@@ -54,13 +47,11 @@ def plan(
         ),
     ] = False,
     execute: Annotated[bool, typer.Option(help="Execute the plan.")] = True,
-    realtime: Annotated[bool, typer.Option(help="Run no faster than reality.")] = True,
+    realtime: task_run.Realtime = True,
     meshcat: Annotated[
         bool, typer.Option(help="Show tree and run in a browser, and record them.")
     ] = True,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the results, by default runs/TIME.")
-    ] = None,
+    out: task_run.Out = None,
 ) -> None:
     """Plans one task with the kinodynamic RRT, and executes the plan.
 
