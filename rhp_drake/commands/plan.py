@@ -174,6 +174,7 @@ class _ShownPlanner:
         from rhp_drake.planning.kinodynamic_rrt import plan as grow_tree
 
         growth: Growth | None = None
+        nearest = _nearest(state[None], goals)
         begin = time.perf_counter()
         self.num_begun += 1
         if self.drawing is not None:
@@ -183,9 +184,11 @@ class _ShownPlanner:
         with self.console.status("Planning", refresh_per_second=4) as status:
 
             def on_growth(newest: "Growth") -> None:
-                nonlocal growth
+                nonlocal growth, nearest
                 growth = newest
-                status.update(_progress(growth, time.perf_counter() - begin))
+                nearest = min(nearest, _nearest(growth.children, goals))
+                seconds = time.perf_counter() - begin
+                status.update(_progress(growth, nearest, seconds))
                 if self.drawing is not None:
                     self.drawing.add(growth)
 
@@ -200,7 +203,7 @@ class _ShownPlanner:
         if self.drawing is not None:
             self.drawing.draw()
         if growth is not None:
-            self.console.print(_progress(growth, found.seconds))
+            self.console.print(_progress(growth, nearest, found.seconds))
         if self.num_ended == 0:
             self._write(found, goals, growth)
             if found.actions is not None:
@@ -221,10 +224,29 @@ class _ShownPlanner:
         )
 
 
-def _progress(growth: "Growth", seconds: float) -> str:
+def _nearest(states: "np.ndarray", goals: "np.ndarray") -> float:
+    """How near the target has come to its goal with all obstacles in their regions.
+
+    Args:
+        states: Shape (N, 3 + 3 m).
+        goals: Shape (m, 2).
+
+    Returns:
+        The least distance, m; inf if no state has all obstacles there.
+    """
+    import numpy as np
+
+    from rhp_drake.task import GOAL_RADIUS, object_positions
+
+    distances = np.linalg.norm(object_positions(states) - goals, axis=-1)
+    inside = (distances[:, 1:] <= GOAL_RADIUS).all(axis=1)
+    return float(distances[inside, 0].min(initial=np.inf))
+
+
+def _progress(growth: "Growth", nearest: float, seconds: float) -> str:
     """How far a search has come, in one line."""
     trees = "1 tree" if growth.num_trees == 1 else f"{growth.num_trees} trees"
-    reached = f"target at best {100 * growth.nearest:.1f} cm from its goal"
+    reached = f"target at best {100 * nearest:.1f} cm from its goal"
     if growth.plan_length is not None:
         reached = f"a plan of {growth.plan_length} actions"
     return (

@@ -70,8 +70,6 @@ class Growth:
         num_transitions: Actions simulated so far, in all trees.
         num_trees: Trees begun so far.
         num_nodes: Of the present tree.
-        nearest: The least distance from the target to its goal in any tree's state
-            that has every obstacle inside its region, m; inf if there is none.
         source: The node that was expanded, shape (3 + 3 m,).
         children: The nodes that the tree got from it, shape (k, 3 + 3 m).
         plan_length: Actions of the best plan so far; None if there is none yet.
@@ -80,7 +78,6 @@ class Growth:
     num_transitions: int
     num_trees: int
     num_nodes: int
-    nearest: float
     source: np.ndarray
     children: np.ndarray
     plan_length: int | None
