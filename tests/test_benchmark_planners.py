@@ -9,10 +9,10 @@ from rhp_drake.benchmarks.planners import (
     PlannerTrial,
     check_planners,
     compare_planners,
-    leads_to_goal,
 )
 from rhp_drake.errors import InputError
 from rhp_drake.frozen_instances import load_instances
+from rhp_drake.planning.search import leads_to_goal
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION, stream
 from rhp_drake.task import Action, TaskInstance

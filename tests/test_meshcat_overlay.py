@@ -112,7 +112,7 @@ def grow(state, tree, *, hand=0.0, target=0.0, count=1) -> Growth:
     """A node with `count` children that have moved along x, m."""
     children = np.repeat(state[None], count, axis=0)
     children[:, [0, 3]] += [hand, target]
-    return Growth(0, tree, 0, 0.1, state, children, None)
+    return Growth(0, tree, 0, state, children, None)
 
 
 def test_tree_is_drawn_as_it_grows(instance):

@@ -3,10 +3,12 @@
 from dataclasses import replace
 import json
 
+import numpy as np
 import pytest
 
 from rhp_drake import cli
 from rhp_drake.planning.kinodynamic_rrt import plan as grow_tree
+from rhp_drake.planning.search import Growth, Plan, SearchRecord
 
 EASY = """
 easy:
@@ -138,6 +140,22 @@ def test_no_plan(rhp, tmp_path, capsys):
     assert shown["actions"] is None
     assert len(shown["states"]) == 1
     assert read(tmp_path / "out" / "run.json")["outcome"]["status"] == "policy_failed"
+
+
+def test_says_how_near_the_target_came(rhp, tmp_path, monkeypatch, capsys):
+    def plan(push_model, state, goals, *arguments, on_growth, **options):
+        # The target's distance from its goal, and the first obstacle's, m.
+        for target, obstacle in ((0.09, 0.0), (0.01, 0.07), (0.08, 0.05), (0.1, 0.0)):
+            child = state.copy()
+            child[3:5] = goals[0] + [target, 0.0]
+            child[6:8] = goals[1] + [obstacle, 0.0]
+            on_growth(Growth(1, 1, 1, state, child[None], None))
+        on_growth(Growth(1, 1, 1, state, np.empty((0, len(state))), None))
+        return Plan(None, state[None], SearchRecord(len(state)).search(), 1.0, np.nan)
+
+    monkeypatch.setattr(PLAN, plan)
+    assert rhp("plan", "--no-meshcat", "--out", "out") == 1
+    assert "target at best 8.0 cm from its goal" in capsys.readouterr().out
 
 
 def test_ctrl_c_in_the_search(rhp, tmp_path, monkeypatch, capsys):

@@ -168,6 +168,36 @@ OMPL_PLANNERS: Final[dict[str, Callable[[Any], Any]]] = {
 }
 
 
+def _make_information(space: Any, problem: Problem) -> Any:
+    """OMPL's SpaceInformation: how to sample `space`, and what the actions do in it."""
+    information = control.SpaceInformation(
+        space, control.DiscreteControlSpace(space, 0, len(HAND_ACTIONS) - 1)
+    )
+
+    def propagate(start: Any, action: Any, duration: float, result: Any) -> None:
+        node = problem.children(problem.node(start)).get(action.value)
+        if node is None:
+            problem.write_no_node(result)
+        else:
+            problem.write(result, node)
+
+    space.setStateSamplerAllocator(
+        base.StateSamplerAllocator(lambda of: _Sampler(of, problem))
+    )
+    information.setDirectedControlSamplerAllocator(
+        control.DirectedControlSamplerAllocator(
+            lambda of: _DirectedSampler(of, problem, space)
+        )
+    )
+    information.setStatePropagator(control.StatePropagatorFn(propagate))
+    information.setStateValidityChecker(
+        base.StateValidityCheckerFn(lambda state: problem.node(state) != NO_NODE)
+    )
+    information.setMinMaxControlDuration(1, 1)
+    information.setPropagationStepSize(1.0)
+    return information
+
+
 def plan_with_ompl(
     name: str,
     push_model: PushModel,
@@ -197,16 +227,7 @@ def plan_with_ompl(
     util.RNG.setSeed(int(generator.integers(1, 2**31)))
     problem = Problem(push_model, task, generator)
     space = _make_space(task.num_objects)
-    information = control.SpaceInformation(
-        space, control.DiscreteControlSpace(space, 0, len(HAND_ACTIONS) - 1)
-    )
-
-    def propagate(start: Any, action: Any, duration: float, result: Any) -> None:
-        node = problem.children(problem.node(start)).get(action.value)
-        if node is None:
-            problem.write_no_node(result)
-        else:
-            problem.write(result, node)
+    information = _make_information(space, problem)
 
     def stop() -> bool:
         return (
@@ -214,20 +235,6 @@ def plan_with_ompl(
             or time.perf_counter() - begin > time_limit
         )
 
-    space.setStateSamplerAllocator(
-        base.StateSamplerAllocator(lambda of: _Sampler(of, problem))
-    )
-    information.setDirectedControlSamplerAllocator(
-        control.DirectedControlSamplerAllocator(
-            lambda of: _DirectedSampler(of, problem, space)
-        )
-    )
-    information.setStatePropagator(control.StatePropagatorFn(propagate))
-    information.setStateValidityChecker(
-        base.StateValidityCheckerFn(lambda state: problem.node(state) != NO_NODE)
-    )
-    information.setMinMaxControlDuration(1, 1)
-    information.setPropagationStepSize(1.0)
     definition = base.ProblemDefinition(information)
     start = base.State(space)
     problem.write(start(), 0)

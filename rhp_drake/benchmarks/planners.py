@@ -14,11 +14,11 @@ from rhp_drake.planning.best_first import plan_best_first
 from rhp_drake.planning.kinodynamic_rrt import IMPROVEMENT, plan
 from rhp_drake.planning.policy_config import DEFAULT_Q_NETWORK
 from rhp_drake.planning.receding_horizon import ValueFunction
-from rhp_drake.planning.search import Plan
+from rhp_drake.planning.search import Plan, leads_to_goal
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.resources import resolve
-from rhp_drake.task import MAX_ACTIONS, TaskInstance, allowed_actions, goals_reached
+from rhp_drake.task import TaskInstance
 from rhp_drake.value.q_network import load_q_network
 from rhp_drake.workers import run_over
 
@@ -213,17 +213,3 @@ def _run(trial: PlannerTrial, time_limit: float, seed: int) -> PlannerResult:
     return PlannerResult(
         solved, found.seconds, found.first_seconds, found.num_transitions, num_actions
     )
-
-
-def leads_to_goal(
-    push_model: PushModel, task: TaskInstance, actions: np.ndarray
-) -> bool:
-    """Whether a plan (L,) of allowed actions, not too many, solves the task."""
-    if len(actions) > MAX_ACTIONS:
-        return False
-    state = task.initial_state
-    for action in actions:
-        if not allowed_actions(state, np.array([action]))[0]:
-            return False
-        state = push_model.step(state[None], np.array([action]))[0]
-    return bool(goals_reached(state, task.goals))

@@ -19,23 +19,16 @@ if TYPE_CHECKING:
 
 
 def run(
-    scenario: Annotated[
-        Path, typer.Argument(help="A scenario file, or the name of a bundled one.")
-    ],
+    scenario: task_run.ScenarioFile,
     *,
-    name: Annotated[
-        str | None, typer.Option(help="Which scenario, if the file has several.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Instead of the scenario's.")] = None,
+    name: task_run.ScenarioName = None,
+    seed: task_run.Seed = None,
     policy: Annotated[
         str | None,
         typer.Option(help=f"Instead of the scenario's: {', '.join(POLICIES)}."),
     ] = None,
-    scenario_text: Annotated[
-        str | None,
-        typer.Option(help="YAML to merge into it, e.g. '{world_physics: high}'."),
-    ] = None,
-    realtime: Annotated[bool, typer.Option(help="Run no faster than reality.")] = True,
+    scenario_text: task_run.ScenarioText = None,
+    realtime: task_run.Realtime = True,
     meshcat: Annotated[
         bool, typer.Option(help="Show the run in a browser, and record it.")
     ] = True,
@@ -43,9 +36,7 @@ def run(
         Path | None,
         typer.Option(help="Write the diagram to this file, and do not run."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the results, by default runs/TIME.")
-    ] = None,
+    out: task_run.Out = None,
 ) -> None:
     """Runs one task in closed loop.
 

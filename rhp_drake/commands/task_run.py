@@ -8,7 +8,9 @@ import logging
 import math
 from pathlib import Path
 import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -22,6 +24,23 @@ if TYPE_CHECKING:
     from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 
 INTERRUPTED: Final = "interrupted"
+
+# Options of both commands.
+ScenarioFile = Annotated[
+    Path, typer.Argument(help="A scenario file, or the name of a bundled one.")
+]
+ScenarioName = Annotated[
+    str | None, typer.Option(help="Which scenario, if the file has several.")
+]
+Seed = Annotated[int | None, typer.Option(help="Instead of the scenario's.")]
+ScenarioText = Annotated[
+    str | None,
+    typer.Option(help="YAML to merge into it, e.g. '{world_physics: high}'."),
+]
+Realtime = Annotated[bool, typer.Option(help="Run no faster than reality.")]
+Out = Annotated[
+    Path | None, typer.Option(help="Folder of the results, by default runs/TIME.")
+]
 
 
 @dataclass(frozen=True)

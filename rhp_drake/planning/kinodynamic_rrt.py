@@ -8,8 +8,7 @@ to the node's own target object.
 
 The first plan of an RRT has detours.  It gets shorter by growing further trees that
 are cut where they can no longer beat it, and keeping the best plan (anytime RRTs,
-Ferguson and Stentz 2006).  To leave out actions of the plan and simulate the rest anew
-saved half as many actions for the same number of transitions.
+Ferguson and Stentz 2006).
 """
 
 from collections.abc import Callable
@@ -48,8 +47,8 @@ _HEAVIEST_TO_IMPROVE: Final = np.array([1.0, 1.5, 1.0])
 # Simulated actions after which a tree is given up for a fresh one: the time to a plan
 # is heavy-tailed, and another tree's luck beats this one's patience.
 _RESTART: Final = 1500
-# Actions that are worth simulating for a shorter plan: on 60 validation tasks 600,
-# 1200 and 2000 of them lead from 16.7 actions to 15.5, 15.0 and 14.8.
+# Actions that are worth simulating for a shorter plan.  For what they bring, see
+# `rhp bench planners --planners rrt,rrt_first`: the latter stops at its first plan.
 IMPROVEMENT: Final = 1000
 # m: the hand's opening.
 _OPENING: Final = 0.10
@@ -195,50 +194,33 @@ def plan(
     best = (np.empty(0, int), state[None]) if goals_reached(state, goals) else None
     length_to_beat = None
     first_seconds = math.nan if best is None else 0.0
-    restart_at, stop_at = _RESTART, max_transitions if best is None else 0
-    num_trees, nearest = 1, _nearest(state[None], goals)
+    can_grow = best is None and allowed_actions(state, action_set).any()
+    restart_at, stop_at = _RESTART, max_transitions if can_grow else 0
+    num_trees = 1
     while record.num_transitions < stop_at:
         if time.perf_counter() - begin > time_limit:
             break
-        place = (
-            goals[0]
-            if generator.random() < _GOAL_BIAS
-            else generator.uniform(WORKSPACE_LOWER, WORKSPACE_UPPER)
-        )
-        node = tree.pop_nearest(place)
+        node = tree.pop_nearest(_draw_place(generator, goals))
         if node is None or record.num_transitions >= restart_at:
             tree = _Tree(state, goals, generator, length_to_beat)
             restart_at = record.num_transitions + _RESTART
             num_trees += 1
             continue
-        source = tree.nodes.states[node]
-        actions = action_set[allowed_actions(source, action_set)]
-        if not len(actions):
-            if node == 0:
-                break
-            continue
-        sources = np.repeat(source[None], len(actions), axis=0)
-        children = push_model.step(sources, actions)
-        origins = np.repeat(tree.nodes.transitions[node], len(actions))
-        indices = record.add(sources, actions, children, origins)
-        before = len(tree.nodes)
-        found = _grow(tree, node, actions, children, indices)
+        num_nodes = len(tree.nodes)
+        found = _expand(tree, node, push_model, action_set, record)
         if found is not None:
             if best is None:
                 first_seconds = time.perf_counter() - begin
                 stop_at = min(stop_at, record.num_transitions + improvement)
             best, length_to_beat = found, len(found[0])
         if on_growth is not None:
-            added = tree.nodes.states[before:]
-            nearest = min(nearest, _nearest(added, goals))
             on_growth(
                 Growth(
                     record.num_transitions,
                     num_trees,
                     len(tree.nodes),
-                    nearest,
-                    source,
-                    added,
+                    tree.nodes.states[node],
+                    tree.nodes.states[num_nodes:],
                     length_to_beat,
                 )
             )
@@ -255,21 +237,33 @@ def plan(
     return Plan(*best, record.search(), seconds, first_seconds)
 
 
-def _nearest(states: np.ndarray, goals: np.ndarray) -> float:
-    """`Growth.nearest` of states (N, 3 + 3 m)."""
-    distances = np.linalg.norm(object_positions(states) - goals, axis=-1)
-    inside = (distances[:, 1:] <= GOAL_RADIUS).all(axis=1)
-    return float(distances[inside, 0].min(initial=np.inf))
+def _draw_place(generator: np.random.Generator, goals: np.ndarray) -> np.ndarray:
+    """A place for the target, x and y (m), to grow to."""
+    if generator.random() < _GOAL_BIAS:
+        return goals[0]
+    return generator.uniform(WORKSPACE_LOWER, WORKSPACE_UPPER)
 
 
-def _grow(
+def _expand(
     tree: _Tree,
     node: int,
-    actions: np.ndarray,
-    children: np.ndarray,
-    indices: np.ndarray,
+    push_model: PushModel,
+    action_set: np.ndarray,
+    record: SearchRecord,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Adds a node's children, and returns the plan if one of them is a goal."""
+    """Simulates a node's actions, and adds its children up to the first goal state.
+
+    Returns:
+        The plan to that state, as `Nodes.path` has it; None if there is none.
+    """
+    source = tree.nodes.states[node]
+    actions = action_set[allowed_actions(source, action_set)]
+    if not len(actions):
+        return None
+    sources = np.repeat(source[None], len(actions), axis=0)
+    children = push_model.step(sources, actions)
+    origins = np.repeat(tree.nodes.transitions[node], len(actions))
+    indices = record.add(sources, actions, children, origins)
     for i in np.flatnonzero(~hopeless(children, tree.goals)):
         child = children[i]
         added = tree.add(child, node, int(actions[i]), int(indices[i]))

@@ -1,11 +1,20 @@
-"""What planners share: a plan, what was simulated for it, and which states are new."""
+"""What planners share: plans, what was simulated for them, which states are new."""
 
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from rhp_drake.task import GOAL_RADIUS, object_positions, objects_fallen
+from rhp_drake.push_model.transition import PushModel
+from rhp_drake.task import (
+    GOAL_RADIUS,
+    MAX_ACTIONS,
+    TaskInstance,
+    allowed_actions,
+    goals_reached,
+    object_positions,
+    objects_fallen,
+)
 
 # m: an obstacle this far out of its region is as good as lost.
 _OBSTACLE_LIMIT: Final = 1.5 * GOAL_RADIUS
@@ -70,8 +79,6 @@ class Growth:
         num_transitions: Actions simulated so far, in all trees.
         num_trees: Trees begun so far.
         num_nodes: Of the present tree.
-        nearest: The least distance from the target to its goal in any tree's state
-            that has every obstacle inside its region, m; inf if there is none.
         source: The node that was expanded, shape (3 + 3 m,).
         children: The nodes that the tree got from it, shape (k, 3 + 3 m).
         plan_length: Actions of the best plan so far; None if there is none yet.
@@ -80,7 +87,6 @@ class Growth:
     num_transitions: int
     num_trees: int
     num_nodes: int
-    nearest: float
     source: np.ndarray
     children: np.ndarray
     plan_length: int | None
@@ -214,3 +220,17 @@ def hopeless(states: np.ndarray, goals: np.ndarray) -> np.ndarray:
     """
     moved = np.linalg.norm(object_positions(states)[:, 1:] - goals[1:], axis=-1)
     return (moved > _OBSTACLE_LIMIT).any(axis=1) | objects_fallen(states)
+
+
+def leads_to_goal(
+    push_model: PushModel, task: TaskInstance, actions: np.ndarray
+) -> bool:
+    """Whether a plan (L,) of allowed actions, not too many, solves the task."""
+    if len(actions) > MAX_ACTIONS:
+        return False
+    state = task.initial_state
+    for action in actions:
+        if not allowed_actions(state, np.array([action]))[0]:
+            return False
+        state = push_model.step(state[None], np.array([action]))[0]
+    return bool(goals_reached(state, task.goals))
