@@ -20,6 +20,7 @@ from torch.nn.functional import mse_loss, smooth_l1_loss
 
 from rhp_drake.learning.augmentation import NoSymmetry, Symmetry
 from rhp_drake.learning.dataset import Dataset
+from rhp_drake.learning.imitation import ImitationConfig, Plans
 from rhp_drake.learning.learner import Learner
 from rhp_drake.task import (
     GOAL_RADIUS,
@@ -52,6 +53,9 @@ class FittedQConfig:
             network's own.
         symmetry: Whether samples are seen through random symmetries.
         squared_errors: Whether errors above 1 count squared, or by their size.
+        imitation_weight: Of the loss of imitation (Eq. 2 and 3) beside that of Eq. 4,
+            on the plans of the first source; as Hester et al. (2018) do, it holds down
+            the values of actions that were never tried.
     """
 
     discount: float = 1.0
@@ -65,6 +69,7 @@ class FittedQConfig:
     double_q: bool = True
     symmetry: bool = True
     squared_errors: bool = False
+    imitation_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -210,6 +215,11 @@ class FittedQ(Learner):
         super().__init__(network, config, generator)
         self._config = config
         self.sources = list(sources)
+        self._plans = None
+        if config.imitation_weight:
+            self._plans = Plans(
+                self.sources[0], ImitationConfig.margin, config.discount
+            )
         self._target = QNetwork(network.num_objects)
         self._target.load_state_dict(network.state_dict())
 
@@ -258,4 +268,11 @@ class FittedQ(Learner):
         q = network(states, goals).gather(1, actions[:, None])[:, 0]
         loss = mse_loss if config.squared_errors else smooth_l1_loss
         losses = loss(q, targets, reduction="none")
-        return (losses * asked).mean()
+        return (losses * asked).mean() + self._imitation_loss()
+
+    def _imitation_loss(self) -> torch.Tensor | float:
+        if self._plans is None:
+            return 0.0
+        config = self._config
+        loss = self._plans.loss(self.network, config.batch_size, self._generator)
+        return config.imitation_weight * loss

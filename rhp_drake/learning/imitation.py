@@ -62,6 +62,45 @@ def imitation_targets(
     return targets.scatter(1, actions[:, None], chosen)
 
 
+class Plans:
+    """State-action pairs on plans, of which batches are drawn.
+
+    Args:
+        demonstrations: With at least one plan.
+        margin: k.
+        discount: gamma.
+    """
+
+    def __init__(self, demonstrations: Dataset, margin: int, discount: float) -> None:
+        d = demonstrations
+        self._states = torch.from_numpy(d.plan_states).float()
+        self._goals = torch.from_numpy(d.goals[d.plan_tasks]).float()
+        self._actions = torch.from_numpy(d.plan_actions).long()
+        self._actions_left = torch.from_numpy(d.plan_actions_left).float()
+        self._margin = margin
+        self._discount = discount
+
+    def loss(
+        self, network: QNetwork, batch_size: int, generator: np.random.Generator
+    ) -> torch.Tensor:
+        """The loss of Eq. 2 and 3 on a batch, seen through random symmetries."""
+        rows = generator.integers(len(self._states), size=batch_size)
+        batch = torch.from_numpy(rows)
+        symmetry = Symmetry(batch_size, network.num_objects, generator)
+        q = network(
+            symmetry.states(self._states[batch]), symmetry.goals(self._goals[batch])
+        )
+        targets = imitation_targets(
+            q.detach(),
+            symmetry.actions(self._actions[batch]),
+            self._actions_left[batch],
+            self._margin,
+            self._discount,
+        )
+        # Summed over the actions, so that the chosen one weighs as in Eq. 2.
+        return (targets - q).square().sum(dim=1).mean()
+
+
 class Imitation(Learner):
     """Trains a Q-network by Eq. 2 and 3.
 
@@ -80,27 +119,8 @@ class Imitation(Learner):
         generator: np.random.Generator,
     ) -> None:
         super().__init__(network, config, generator)
-        self._config = config
-        d = demonstrations
-        self._states = torch.from_numpy(d.plan_states).float()
-        self._goals = torch.from_numpy(d.goals[d.plan_tasks]).float()
-        self._actions = torch.from_numpy(d.plan_actions).long()
-        self._actions_left = torch.from_numpy(d.plan_actions_left).float()
+        self._plans = Plans(demonstrations, config.margin, config.discount)
 
     def _loss(self) -> torch.Tensor:
-        config, size = self._config, self._config.batch_size
-        rows = self._generator.integers(len(self._states), size=size)
-        batch = torch.from_numpy(rows)
-        symmetry = Symmetry(size, self.network.num_objects, self._generator)
-        q = self.network(
-            symmetry.states(self._states[batch]), symmetry.goals(self._goals[batch])
-        )
-        targets = imitation_targets(
-            q.detach(),
-            symmetry.actions(self._actions[batch]),
-            self._actions_left[batch],
-            config.margin,
-            config.discount,
-        )
-        # Summed over the actions, so that the chosen one weighs as in Eq. 2.
-        return (targets - q).square().sum(dim=1).mean()
+        size = self.config.batch_size
+        return self._plans.loss(self.network, size, self._generator)
