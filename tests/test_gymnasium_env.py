@@ -26,7 +26,9 @@ from rhp_drake.value.features import features
 gymnasium = pytest.importorskip("gymnasium")
 
 ID = "rhp_drake.gymnasium_env:rhp_drake/PushInClutter-v0"
-PLANS = Path(rhp_drake.__file__).parent / "data" / "plans.parquet"
+PACKAGE = Path(rhp_drake.__file__).parent
+PLANS = PACKAGE / "data" / "plans.parquet"
+README = PACKAGE.parent / "README.md"
 # The target inside the hand's opening, its goal two pushes ahead.
 EASY = TaskInstance(
     np.array([0.4, 0.0, 0.0, 0.4, 0.0, 0.0, 0.3, 0.25, 0.5]),
@@ -154,6 +156,14 @@ def test_falling_ends_the_episode_as_its_worst_end():
     assert objects_fallen(info["state"])
     assert (reward, terminated, truncated) == (-1 - MAX_ACTIONS, True, False)
     assert not info["is_success"]
+
+
+def test_the_example_of_the_readme(capsys):
+    if not README.exists():
+        pytest.skip("the package is installed without its repository")
+    section = README.read_text().partition("## As a Gymnasium environment")[2]
+    exec(section.partition("```python\n")[2].partition("```")[0], {})
+    assert capsys.readouterr().out.startswith(("False [", "True ["))
 
 
 def test_truncation_after_all_actions():
