@@ -27,7 +27,7 @@ LAYERS = (
     {"push_model", "station", "value"},
     {"planning"},
     {"learning", "systems"},
-    {"scenario"},
+    {"gymnasium_env", "scenario"},
     {"closed_loop"},
     {"evaluation", "run_record"},
     {"benchmarks"},

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rhp_drake.commands.bench_action_frames import action_frames
+from rhp_drake.commands.bench_dqn import dqn
 from rhp_drake.commands.bench_planners import planners
 from rhp_drake.commands.bench_push_model import push_model
 from rhp_drake.commands.bench_reinforcement import reinforcement
@@ -29,6 +30,7 @@ bench.command()(push_model)
 bench.command()(action_frames)
 bench.command()(planners)
 bench.command()(reinforcement)
+bench.command()(dqn)
 
 
 @bench.command()
