@@ -60,12 +60,12 @@ class FittedQConfig:
 
     discount: float = 1.0
     l2: float = 1e-6
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     batch_size: int = 1024
     num_steps: int = 40_000
     target_rate: float = 0.005
     hindsight: float = 0.5
-    search_returns: bool = True
+    search_returns: bool = False
     double_q: bool = True
     symmetry: bool = True
     squared_errors: bool = False

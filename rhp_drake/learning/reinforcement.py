@@ -48,14 +48,14 @@ class Rounds:
         executed_only: Whether roll-outs and searches are not learned from.
     """
 
-    num_tasks: int = 60
+    num_tasks: int = 100
     num_steps: int = 1000
     epsilon: float = 0.1
     temperature: float = 0.5
     num_roll_outs: int = 6
     horizon: int = 6
     uncertainty: str = "none"
-    num_searches: int = 3
+    num_searches: int = 0
     executed_only: bool = False
 
 
