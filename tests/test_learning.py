@@ -112,6 +112,32 @@ def test_hindsight_goals_are_reached_in_time(data):
     assert np.median(np.abs(difference)) < 1e-5
 
 
+def test_simulated_ways_to_the_goal_bound_the_values(data):
+    config = FittedQConfig(batch_size=4000, hindsight=0.0)
+    assert not np.isfinite(sample([data], config, stream(1)).least_returns).any()
+    bounded = sample([data], replace(config, search_returns=True), stream(1))
+    known = np.isfinite(bounded.least_returns)
+    assert 0.01 < known.mean() < 1
+    one = bounded.least_returns == -1
+    assert goals_reached(bounded.next_states[one], bounded.goals[one]).all()
+    assert not goals_reached(
+        bounded.next_states[known & ~one], bounded.goals[known & ~one]
+    ).any()
+
+
+def test_the_loss_of_imitation_may_stay(data):
+    """It is the sum of both, on the same batches."""
+
+    def loss(weight):
+        torch.manual_seed(0)
+        config = FittedQConfig(batch_size=64, imitation_weight=weight)
+        return FittedQ(QNetwork(3), [data], config, stream(3))._loss().item()
+
+    alone, half, whole = loss(0.0), loss(0.5), loss(1.0)
+    assert whole - alone == pytest.approx(2 * (half - alone), rel=1e-3)
+    assert whole > alone
+
+
 def test_symmetries_are_those_of_the_task(data):
     rows = np.arange(200)
     states = data.search_states[rows].astype(float)
@@ -136,11 +162,14 @@ def test_symmetries_are_those_of_the_task(data):
 
 LEARNERS = [
     (FittedQ, FittedQConfig(num_steps=8, batch_size=64)),
+    (FittedQ, FittedQConfig(num_steps=8, batch_size=64, imitation_weight=0.1)),
     (Imitation, ImitationConfig(num_steps=8, batch_size=64)),
 ]
 
 
-@pytest.mark.parametrize(("kind", "config"), LEARNERS, ids=["fitted_q", "imitation"])
+@pytest.mark.parametrize(
+    ("kind", "config"), LEARNERS, ids=["fitted_q", "both", "imitation"]
+)
 def test_training_goes_on_from_a_checkpoint_as_if_never_stopped(
     kind, config, data, tmp_path
 ):
