@@ -82,9 +82,10 @@ def make_dqn(seed: int) -> "DQN":
     """DQN that has not learnt yet, with its environment."""
     import gymnasium
     from stable_baselines3 import DQN
+    from stable_baselines3.common.logger import Logger
 
     make_repeatable(seed)
-    return DQN(
+    model = DQN(
         "MlpPolicy",
         gymnasium.make(ENVIRONMENT, num_objects=NUM_OBJECTS),
         policy_kwargs={"net_arch": list(HIDDEN_LAYERS)},
@@ -92,6 +93,9 @@ def make_dqn(seed: int) -> "DQN":
         device="cpu",
         **SETTINGS,
     )
+    # Its own one leaves a folder behind among the temporary files.
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    return model
 
 
 def train_dqn(
