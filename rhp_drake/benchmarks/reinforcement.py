@@ -167,7 +167,9 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
     curve_path = path.with_suffix(".curve.json")
     curve = json.loads(curve_path.read_text()) if curve_path.exists() else {}
     for event in train(learner, checkpoint, asdict(variant.rounds), reinforcement):
-        if isinstance(event, Stepped) and event.num_steps % _PERIOD == 0:
+        if isinstance(event, Stepped) and (
+            event.num_steps % _PERIOD == 0 or event.num_steps == config.num_steps
+        ):
             # Steps that are taken again after a stop have the same successes.
             curve[str(event.num_steps)], _ = greedy_successes(network)
             write_atomically(curve_path, json.dumps(curve))

@@ -105,10 +105,13 @@ def _table(by_variant: "dict[str, list[TrainingResult]]", steps: int) -> "Table"
         title=f"After {steps} steps, % of validation tasks (95 % Wilson)",
         box=SIMPLE_HEAD,
         title_justify="left",
+        # So it fits into 80 columns.
+        padding=(0, 1, 0, 0),
+        show_edge=False,
     )
     table.add_column("variant", no_wrap=True)
     for heading in ("GP", "by seed", "RHP-33", "by seed", "transitions"):
-        table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column(heading, justify="right")
     for name, results in by_variant.items():
         num_tasks = results[0].num_tasks
         transitions = sum(r.num_transitions for r in results) / len(results)
