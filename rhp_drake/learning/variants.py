@@ -24,8 +24,8 @@ class Variant:
 
 BEST: Final = Variant()
 # Section V: Q-learning on plans and on what was executed, squared errors, a gradient
-# step for each action (an episode has some 16).  The paper does not say what keeps the
-# values of actions that were never tried from rising; here the loss of imitation does.
+# step for each action (an episode has some 16).  The loss of imitation stays, which the
+# paper does not say: it is to hold down the values of actions that were never tried.
 PAPER: Final = Variant(
     learning=FittedQConfig(
         learning_rate=1e-4,

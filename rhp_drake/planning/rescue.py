@@ -1,7 +1,7 @@
 """A policy that is got out of loops: where it has been before, a plan takes over.
 
-RHP fails by going round in circles: the values of some states are so wrong that its
-roll-outs lead back to where it was.  A search over a hundred pushes, best first, sees
+GP, and RHP at times, go round in circles: the values of some states are so wrong that
+they lead back to where it was.  A search over a hundred pushes, best first, sees
 farther than six roll-outs do, and knows which states it has seen.
 """
 
