@@ -5,11 +5,12 @@ import pytest
 import torch
 
 from rhp_drake.planning.best_first import plan_best_first
+from rhp_drake.planning.kinodynamic_rrt import plan
 from rhp_drake.planning.search import leads_to_goal
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import TRAINING, stream
 from rhp_drake.resources import models_path
-from rhp_drake.task import goals_reached, sample_instance
+from rhp_drake.task import TaskInstance, goals_reached, sample_instance
 from rhp_drake.value.q_network import QNetwork, load_q_network
 
 
@@ -87,3 +88,14 @@ def test_a_goal_state_needs_no_actions(push_model, q_network):
     found = plan_best_first(push_model, q_network, instance.initial_state, goals)
     assert len(found.actions) == 0
     assert found.first_seconds == found.seconds
+
+
+def test_an_obstacle_that_is_far_out_is_brought_back(push_model, q_network):
+    # The target is home, and an obstacle 12 cm away from where it belongs.
+    state = np.array([0.3, 0, 0, 0.6, 0, 0, 0.42, 0, 0, 0.3, -0.2, 0])
+    goals = np.array([[0.6, 0.0], [0.54, 0.0], [0.3, -0.2]])
+    task = TaskInstance(state, goals)
+    found = plan_best_first(push_model, q_network, state, goals)
+    assert leads_to_goal(push_model, task, found.actions)
+    found = plan(push_model, state, goals, stream(0), max_transitions=3000)
+    assert leads_to_goal(push_model, task, found.actions)

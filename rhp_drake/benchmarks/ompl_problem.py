@@ -116,7 +116,7 @@ class Problem:
             np.repeat(state[None], len(controls), axis=0), HAND_ACTIONS[controls]
         )
         self.num_transitions += len(controls)
-        for i in np.flatnonzero(~hopeless(results, self.task.goals)):
+        for i in np.flatnonzero(~hopeless(results, self.task.goals, self._states[0])):
             children[int(controls[i])] = len(self._states)
             self._add(results[i], depth)
         return children

@@ -68,7 +68,7 @@ def plan_best_first(
         children = push_model.step(sources, actions)
         indices = record.add(sources, actions, children, nodes.transitions[parents])
         new = []
-        for i in np.flatnonzero(~hopeless(children, goals)):
+        for i in np.flatnonzero(~hopeless(children, goals, state)):
             if nodes.has_near(children[i]):
                 continue
             node = nodes.add(

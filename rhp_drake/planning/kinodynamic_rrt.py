@@ -264,7 +264,7 @@ def _expand(
     children = push_model.step(sources, actions)
     origins = np.repeat(tree.nodes.transitions[node], len(actions))
     indices = record.add(sources, actions, children, origins)
-    for i in np.flatnonzero(~hopeless(children, tree.goals)):
+    for i in np.flatnonzero(~hopeless(children, tree.goals, tree.nodes.states[0])):
         child = children[i]
         added = tree.add(child, node, int(actions[i]), int(indices[i]))
         if added and goals_reached(child, tree.goals):

@@ -16,8 +16,9 @@ from rhp_drake.task import (
     objects_fallen,
 )
 
-# m: an obstacle this far out of its region is as good as lost.
-_OBSTACLE_LIMIT: Final = 1.5 * GOAL_RADIUS
+# m: an obstacle that has got this much further from where it belongs than it was, or
+# than its region reaches, is as good as lost.
+_OBSTACLE_MARGIN: Final = 0.5 * GOAL_RADIUS
 # m: states closer than this in every coordinate are the same to a planner...
 _DUPLICATE_DISTANCE: Final = 0.012
 # ...with this many metres to a radian.
@@ -211,15 +212,23 @@ def _key(states: np.ndarray) -> np.ndarray:
     return keys
 
 
-def hopeless(states: np.ndarray, goals: np.ndarray) -> np.ndarray:
+def hopeless(states: np.ndarray, goals: np.ndarray, root: np.ndarray) -> np.ndarray:
     """Whether no planner should go on from the states, booleans of shape (N,).
 
     Args:
         states: Shape (N, 3 + 3 m).
         goals: Shape (m, 2).
+        root: Where the search began, shape (3 + 3 m,): an obstacle may be lost there
+            already, and has to come back.
     """
-    moved = np.linalg.norm(object_positions(states)[:, 1:] - goals[1:], axis=-1)
-    return (moved > _OBSTACLE_LIMIT).any(axis=1) | objects_fallen(states)
+    limits = np.maximum(_obstacle_distances(root, goals), GOAL_RADIUS)
+    lost = _obstacle_distances(states, goals) > limits + _OBSTACLE_MARGIN
+    return lost.any(axis=-1) | objects_fallen(states)
+
+
+def _obstacle_distances(states: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """How far obstacles are from where they belong, m, shape (..., m - 1)."""
+    return np.linalg.norm(object_positions(states)[..., 1:, :] - goals[1:], axis=-1)
 
 
 def leads_to_goal(
