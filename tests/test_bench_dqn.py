@@ -10,7 +10,7 @@ from rhp_drake import cli
 from rhp_drake.benchmarks import dqn
 from rhp_drake.frozen_instances import load_instances
 from rhp_drake.random_streams import VALIDATION
-from rhp_drake.value.q_network import load_q_network
+from rhp_drake.value.weights import load_q_network
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from rhp_drake.benchmarks.push_profile import measure_profile
 from rhp_drake.frozen_instances import load_instances
 from rhp_drake.random_streams import VALIDATION
 from rhp_drake.task import Action, hand_targets
-from rhp_drake.value.q_network import QNetwork
+from rhp_drake.value.q_network import PaperQNetwork
 
 # A box inside the hand's opening, two far away.
 CAGED = np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.3, 0.2, 0.5, 0.7, 0.25, 0.0])
@@ -120,7 +120,7 @@ def test_speed_by_threads(pairs):
 
 def test_times_of_decisions():
     instances = load_instances(VALIDATION)
-    (times,) = measure_decisions(QNetwork(3).eval(), instances, 3, [1])
+    (times,) = measure_decisions(PaperQNetwork(3).eval(), instances, 3, [1])
     assert times.decisions == 3
     assert 0 < times.p50 <= times.p95
     assert times.network > 0

@@ -11,7 +11,8 @@ from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import TRAINING, stream
 from rhp_drake.resources import models_path
 from rhp_drake.task import TaskInstance, goals_reached, sample_instance
-from rhp_drake.value.q_network import QNetwork, load_q_network
+from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.weights import load_q_network
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def test_the_most_promising_action_is_simulated_first(push_model):
 
 def test_limits(push_model):
     torch.manual_seed(0)
-    untrained = QNetwork(3)
+    untrained = PaperQNetwork(3)
     instance = sample_instance(stream(5, TRAINING, 1))
     arguments = (push_model, untrained, instance.initial_state, instance.goals)
     found = plan_best_first(*arguments, max_transitions=30)

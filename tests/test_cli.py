@@ -7,7 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from rhp_drake import cli
-from rhp_drake.value.q_network import QNetwork
+from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.weights import save_q_network
 
 COMMANDS = (
     *("run", "plan", "demos", "imitate", "reinforce", "evaluate", "figure4"),
@@ -83,7 +84,7 @@ def test_impossible_options(option, monkeypatch, capsys):
 
 def test_evaluate_writes_every_episode(monkeypatch, capsys, tmp_path):
     weights, out = tmp_path / "weights.safetensors", tmp_path / "out.json"
-    QNetwork(3).save(weights)
+    save_q_network(PaperQNetwork(3), weights)
     options = [
         "--policies=gp,rhp33",
         "--levels=none,none",

@@ -9,7 +9,7 @@ import pytest
 from rhp_drake.errors import InputError
 from rhp_drake.learning.demonstration_folder import demonstrate_tasks
 from rhp_drake.learning.demonstrators import PlanningDemonstrator
-from rhp_drake.value.q_network import load_q_network
+from rhp_drake.value.weights import load_q_network
 from rhp_drake.workers import RayCluster, run_over
 
 pytest.importorskip("ray")

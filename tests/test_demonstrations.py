@@ -32,7 +32,8 @@ from rhp_drake.planning.search import SearchRecord
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.resources import models_path
 from rhp_drake.task import MAX_ACTIONS, goals_reached
-from rhp_drake.value.q_network import QNetwork, load_q_network
+from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.weights import load_q_network
 
 DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
 NUM_TASKS = 12
@@ -369,7 +370,7 @@ def equal(made, again):
 
 def test_rhp_demonstrates_with_all_its_roll_outs():
     torch.manual_seed(0)
-    network = QNetwork(3)
+    network = PaperQNetwork(3)
     made, again = (
         RecedingHorizonDemonstrator(11, network).demonstrate(2) for _ in range(2)
     )
@@ -386,7 +387,7 @@ def test_rhp_demonstrates_with_all_its_roll_outs():
 
 def test_rhp_may_keep_what_was_executed_alone():
     torch.manual_seed(0)
-    network = QNetwork(3)
+    network = PaperQNetwork(3)
     whole = RecedingHorizonDemonstrator(11, network).demonstrate(2)
     executed = RecedingHorizonDemonstrator(11, network, executed_only=True)
     search = executed.demonstrate(2).search

@@ -27,7 +27,7 @@ from rhp_drake.learning.demonstration_folder import demonstrate_tasks
 from rhp_drake.learning.demonstrators import PlanningDemonstrator
 from rhp_drake.learning.imitation import Imitation
 from rhp_drake.learning.replay import SHIPPED_PLANS
-from rhp_drake.value.q_network import load_q_network
+from rhp_drake.value.weights import load_q_network
 
 NUM_PLANS = 5
 

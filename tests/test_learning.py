@@ -27,7 +27,7 @@ from rhp_drake.task import (
     hand_targets,
     object_positions,
 )
-from rhp_drake.value.q_network import QNetwork
+from rhp_drake.value.q_network import PaperQNetwork
 
 DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
 
@@ -58,7 +58,7 @@ def test_eq_3_grounds_only_what_looks_better_than_the_plan():
 def test_imitation_learns_the_plans(data):
     torch.manual_seed(0)
     config = ImitationConfig(num_steps=60)
-    learner = Imitation(QNetwork(3), data, config, stream(0))
+    learner = Imitation(PaperQNetwork(3), data, config, stream(0))
     learner.step()
     first = learner.mean_loss
     for _ in range(59):
@@ -69,7 +69,7 @@ def test_imitation_learns_the_plans(data):
 
 def test_a_loss_that_is_not_finite_stops_training(data):
     torch.manual_seed(0)
-    network = QNetwork(3)
+    network = PaperQNetwork(3)
     learner = Imitation(network, data, ImitationConfig(), stream(0))
     learner.step()
     with torch.no_grad():
@@ -131,7 +131,7 @@ def test_the_loss_of_imitation_may_stay(data):
     def loss(weight):
         torch.manual_seed(0)
         config = FittedQConfig(batch_size=64, imitation_weight=weight)
-        return FittedQ(QNetwork(3), [data], config, stream(3))._loss().item()
+        return FittedQ(PaperQNetwork(3), [data], config, stream(3))._loss().item()
 
     alone, half, whole = loss(0.0), loss(0.5), loss(1.0)
     assert whole - alone == pytest.approx(2 * (half - alone), rel=1e-3)
@@ -175,7 +175,7 @@ def test_training_goes_on_from_a_checkpoint_as_if_never_stopped(
 ):
     def learner():
         torch.manual_seed(0)
-        network = QNetwork(3)
+        network = PaperQNetwork(3)
         source = [data] if kind is FittedQ else data
         return network, kind(network, source, config, stream(3))
 
@@ -213,7 +213,7 @@ def test_reinforcement_goes_on_as_if_never_stopped(data, tmp_path):
 
     def learn(folder, stops_at=None):
         torch.manual_seed(0)
-        learner = FittedQ(QNetwork(3), [data], config, stream(3))
+        learner = FittedQ(PaperQNetwork(3), [data], config, stream(3))
         checkpoint = tmp_path / "checkpoint"
         if stops_at is None and folder.exists():
             learner.resume(checkpoint, {})
@@ -240,6 +240,6 @@ def test_reinforcement_goes_on_as_if_never_stopped(data, tmp_path):
 
 
 def test_rounds_must_fit(data, tmp_path):
-    learner = FittedQ(QNetwork(3), [data], FittedQConfig(num_steps=5), stream(3))
+    learner = FittedQ(PaperQNetwork(3), [data], FittedQConfig(num_steps=5), stream(3))
     with pytest.raises(InputError, match="5 steps are no whole number of rounds of 3"):
         Reinforcement(learner, Rounds(num_steps=3), tmp_path, 3, 1, "commit")

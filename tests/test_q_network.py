@@ -9,7 +9,8 @@ from rhp_drake.errors import InputError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import NUM_ACTIONS, sample_instance
 from rhp_drake.value.features import HAND_FEATURES, features, num_features
-from rhp_drake.value.q_network import QNetwork, load_q_network
+from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.weights import load_q_network, save_q_network
 
 PROVENANCE = {
     "command": "rhp reinforce",
@@ -31,7 +32,7 @@ def scenes():
 @pytest.fixture
 def network():
     torch.manual_seed(0)
-    network = QNetwork(3)
+    network = PaperQNetwork(3)
     network.provenance = PROVENANCE
     return network
 
@@ -39,7 +40,7 @@ def network():
 @pytest.fixture
 def path(network, tmp_path):
     path = tmp_path / "weights.safetensors"
-    network.save(path)
+    save_q_network(network, path)
     return path
 
 

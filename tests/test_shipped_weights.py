@@ -17,7 +17,7 @@ from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION, stream
 from rhp_drake.resources import models_path
 from rhp_drake.scenario import Scenario
-from rhp_drake.value.q_network import load_q_network
+from rhp_drake.value.weights import load_q_network
 
 
 def successes(config, count):

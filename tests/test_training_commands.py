@@ -21,7 +21,8 @@ from rhp_drake.learning.learner import Learner
 from rhp_drake.learning.reinforcement import Rounds
 from rhp_drake.learning.replay import SHIPPED_PLANS, rebuild
 from rhp_drake.learning.variants import VARIANTS, Variant
-from rhp_drake.value.q_network import QNetwork, load_q_network
+from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.weights import load_q_network, save_q_network
 
 STEPS = 8
 
@@ -140,7 +141,7 @@ def test_a_full_disk_loses_nothing(limit, plans, monkeypatch, capsys, tmp_path):
 
 def test_reinforce_refuses_what_cannot_be(plans, monkeypatch, capsys, tmp_path):
     start = tmp_path / "start.safetensors"
-    QNetwork(3).save(start)
+    save_q_network(PaperQNetwork(3), start)
     options = ("--demonstrations", plans, "--start", start, "--out", tmp_path / "w")
     assert rhp(monkeypatch, "reinforce", *options, "--variant", "worst") == 2
     assert "'worst' is neither best nor paper." in capsys.readouterr().err

@@ -22,7 +22,7 @@ from rhp_drake.learning.training import make_repeatable
 from rhp_drake.planning.receding_horizon import FAILURE_VALUE
 from rhp_drake.random_streams import VALIDATION
 from rhp_drake.task import REWARD
-from rhp_drake.value.q_network import HIDDEN_LAYERS, QNetwork
+from rhp_drake.value.q_network import HIDDEN_LAYERS, PaperQNetwork, QNetwork
 
 if TYPE_CHECKING:
     from stable_baselines3 import DQN
@@ -145,7 +145,7 @@ def train_dqn(
 
 def to_q_network(model: "DQN") -> QNetwork:
     """The model's weights in the network of the same layers."""
-    network = QNetwork(NUM_OBJECTS)
+    network = PaperQNetwork(NUM_OBJECTS)
     network.layers.load_state_dict(model.q_net.q_net.state_dict())
     return network.eval()
 

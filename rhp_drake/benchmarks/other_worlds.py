@@ -13,7 +13,7 @@ from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
 from rhp_drake.planning.receding_horizon import RecedingHorizon
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION
-from rhp_drake.value.q_network import load_q_network
+from rhp_drake.value.weights import load_q_network
 from rhp_drake.workers import run_over
 
 

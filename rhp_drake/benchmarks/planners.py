@@ -19,7 +19,7 @@ from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.resources import resolve
 from rhp_drake.task import TaskInstance
-from rhp_drake.value.q_network import load_q_network
+from rhp_drake.value.weights import load_q_network
 from rhp_drake.workers import run_over
 
 

@@ -29,10 +29,15 @@ from rhp_drake.planning.receding_horizon import RecedingHorizon
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION, stream
 from rhp_drake.resources import resolve
-from rhp_drake.value.q_network import QNetwork, load_q_network
+from rhp_drake.value.q_network import ARCHITECTURES, QNetwork
+from rhp_drake.value.weights import load_q_network, save_q_network
 from rhp_drake.workers import run_over
 
-START: Final = "package://rhp_drake/q_network/imitation.safetensors"
+# What imitation of the shipped plans made of each architecture.
+STARTS: Final = {
+    "paper": "package://rhp_drake/q_network/imitation.safetensors",
+    "set": "package://rhp_drake/q_network/imitation_set.safetensors",
+}
 _SETTINGS: Final = "settings.json"
 _PLANS: Final = "plans.parquet"
 # Gradient steps between points of a learning curve.
@@ -128,8 +133,8 @@ class Trainings:
         return self.folder / _PLANS
 
     def _settings(self) -> dict[str, Any]:
-        start = repr(load_q_network(resolve(START), NUM_OBJECTS))
-        return {"num_steps": self.num_steps, "start": start}
+        starts = [repr(_start(network)) for network in STARTS]
+        return {"num_steps": self.num_steps, "starts": starts}
 
     def _read(self, training: Training) -> TrainingResult:
         path = self.weights_path(training)
@@ -143,14 +148,18 @@ class Trainings:
         )
 
 
+def _start(architecture: str) -> QNetwork:
+    return load_q_network(resolve(STARTS[architecture]), NUM_OBJECTS)
+
+
 def _train(training: Training, trainings: Trainings) -> TrainingResult:
     """Trains, evaluates, and writes the weights."""
     make_repeatable(training.seed)
     variant = VARIANTS[training.variant]
     if variant.from_scratch:
-        network, sources = QNetwork(NUM_OBJECTS), []
+        network, sources = ARCHITECTURES[variant.network](NUM_OBJECTS), []
     else:
-        network = load_q_network(resolve(START), NUM_OBJECTS)
+        network = _start(variant.network)
         sources = [load_dataset([trainings.plans_path()])]
     config = replace(variant.learning, num_steps=trainings.num_steps)
     learner = FittedQ(network, sources, config, stream(training.seed, "reinforcement"))
@@ -192,7 +201,7 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
         "num_tasks": result.num_tasks,
         "num_transitions": result.num_transitions,
     }
-    network.save(path)
+    save_q_network(network, path)
     checkpoint.unlink(missing_ok=True)
     curve_path.unlink(missing_ok=True)
     return result

@@ -44,6 +44,7 @@ def dqn(
     from rhp_drake.evaluation.machine import describe_machine
     from rhp_drake.files import check_writable, write_atomically
     from rhp_drake.run_record import source_commit
+    from rhp_drake.value.weights import save_q_network
 
     check_available()
     curve_path = out / f"seed_{seed}.json"
@@ -72,7 +73,7 @@ def dqn(
             steps, seed, lambda step: progress.update(bar, completed=step), note
         )
     network.provenance = record
-    network.save(out / f"seed_{seed}.safetensors")
+    save_q_network(network, out / f"seed_{seed}.safetensors")
     console.print(_make_table(curve, f"DQN from scratch, seed {seed}"))
     console.print(machine)
 

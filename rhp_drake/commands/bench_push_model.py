@@ -51,7 +51,7 @@ def push_model(
     from rhp_drake.files import check_writable
     from rhp_drake.frozen_instances import NUM_OBJECTS
     from rhp_drake.resources import resolve
-    from rhp_drake.value.q_network import load_q_network
+    from rhp_drake.value.weights import load_q_network
 
     # Before the minutes of work.
     weights_path = resolve(weights)
@@ -126,7 +126,7 @@ def _measure_decisions(console: "Console", count: int, weights: Path) -> list[di
     from rhp_drake.benchmarks.decision import measure_decisions
     from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
     from rhp_drake.random_streams import VALIDATION
-    from rhp_drake.value.q_network import load_q_network
+    from rhp_drake.value.weights import load_q_network
 
     # As in episodes: such small batches gain nothing from more.
     torch.set_num_threads(1)

@@ -111,7 +111,7 @@ def _demonstrator(
         PlanningDemonstrator,
         RecedingHorizonDemonstrator,
     )
-    from rhp_drake.value.q_network import load_q_network
+    from rhp_drake.value.weights import load_q_network
 
     if method == Method.RRT:
         if weights is not None:

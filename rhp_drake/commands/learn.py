@@ -26,7 +26,14 @@ _Steps = Annotated[int, typer.Option(min=1, help="Gradient steps.")]
 
 
 def imitate(
-    *, demonstrations: _Demos, out: _Out, seed: _Seed = 0, steps: _Steps = 40_000
+    *,
+    demonstrations: _Demos,
+    out: _Out,
+    seed: _Seed = 0,
+    steps: _Steps = 40_000,
+    network: Annotated[
+        str, typer.Option(help="set, or paper: the layers of the paper.")
+    ] = "set",
 ) -> None:
     """Trains a Q-network on the plans alone, by the paper's Eq. 2 and 3.
 
@@ -39,16 +46,19 @@ def imitate(
     from rhp_drake.learning.imitation import Imitation, ImitationConfig
     from rhp_drake.learning.training import make_repeatable
     from rhp_drake.random_streams import stream
-    from rhp_drake.value.q_network import QNetwork
+    from rhp_drake.value.q_network import ARCHITECTURES
 
+    if network not in ARCHITECTURES:
+        known = ", ".join(ARCHITECTURES)
+        raise InputError(f"--network: {network!r} is not one of {known}.")
     check_writable(out)
     make_repeatable(seed)
     data = load_dataset(demonstrations)
     if not data.solved.any():
         raise InputError("none of the demonstrations holds a plan to imitate.")
-    network = QNetwork(data.goals.shape[1])
+    untrained = ARCHITECTURES[network](data.goals.shape[1])
     config = ImitationConfig(num_steps=steps)
-    learner = Imitation(network, data, config, stream(seed, "imitation"))
+    learner = Imitation(untrained, data, config, stream(seed, "imitation"))
     train_and_save(learner, out, demonstrations, {"seed": seed}, Console())
 
 
@@ -80,7 +90,7 @@ def reinforce(
     from rhp_drake.learning.variants import VARIANTS
     from rhp_drake.random_streams import stream
     from rhp_drake.run_record import source_commit
-    from rhp_drake.value.q_network import load_q_network
+    from rhp_drake.value.weights import load_q_network
 
     # Those that leave something out are for `rhp bench reinforcement`.
     if variant not in ("best", "paper"):

@@ -49,6 +49,7 @@ def train_and_save(
     from rhp_drake.evaluation.validation import greedy_successes
     from rhp_drake.learning.demonstration_folder import describe
     from rhp_drake.run_record import source_commit
+    from rhp_drake.value.weights import save_q_network
 
     # Before the work: it may be long, and the code may change meanwhile.
     commit = source_commit()
@@ -74,7 +75,7 @@ def train_and_save(
         **asdict(learner.config),  # type: ignore[call-overload]
         "loss": learner.mean_loss,
     }
-    network.save(out)
+    save_q_network(network, out)
     checkpoint.unlink(missing_ok=True)
     console.print(
         f"{out}: {out.stat().st_size / 1e3:.0f} kB, greedily solves {successes} of "

@@ -31,7 +31,8 @@ from rhp_drake.learning.imitation import Imitation, ImitationConfig
 from rhp_drake.learning.replay import SHIPPED_PLANS, rebuild
 from rhp_drake.learning.training import make_repeatable, train
 from rhp_drake.random_streams import stream
-from rhp_drake.value.q_network import QNetwork, load_q_network
+from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.weights import load_q_network, save_q_network
 from rhp_drake.workers import run_over
 
 _SETTINGS: Final = "settings.json"
@@ -170,7 +171,7 @@ def _make_point(point: Point, figure: Figure4) -> PointResult:
         "successes": successes,
         "batch_size": result.batch_size,
     }
-    learner.network.save(figure.weights_path(point))
+    save_q_network(learner.network, figure.weights_path(point))
     _checkpoint_path(point, figure).unlink(missing_ok=True)
     return result
 
@@ -185,7 +186,7 @@ def _train(point: Point, figure: Figure4) -> Imitation:
     make_repeatable(point.seed)
     data = first_plans(load_dataset(figure.plan_paths()), point.num_plans)
     learner = Imitation(
-        QNetwork(NUM_OBJECTS), data, figure.config, stream(point.seed, "imitation")
+        PaperQNetwork(NUM_OBJECTS), data, figure.config, stream(point.seed, "imitation")
     )
     checkpoint = _checkpoint_path(point, figure)
     origin = figure.settings() | asdict(point)

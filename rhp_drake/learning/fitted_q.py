@@ -10,6 +10,7 @@ Q-learning (van Hasselt et al. 2016).
 """
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, fields
 from typing import Final
 
@@ -220,8 +221,7 @@ class FittedQ(Learner):
             self._plans = Plans(
                 self.sources[0], ImitationConfig.margin, config.discount
             )
-        self._target = QNetwork(network.num_objects)
-        self._target.load_state_dict(network.state_dict())
+        self._target = deepcopy(network)
 
     def _modules(self) -> dict[str, nn.Module]:
         return super()._modules() | {"target": self._target}

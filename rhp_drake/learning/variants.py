@@ -15,11 +15,13 @@ class Variant:
         learning: How the network learns.
         rounds: How RHP acts.
         from_scratch: Whether it begins with a random network and no demonstrations.
+        network: Its architecture, see `value.q_network`.
     """
 
     learning: FittedQConfig = field(default_factory=FittedQConfig)
     rounds: Rounds = field(default_factory=Rounds)
     from_scratch: bool = False
+    network: str = "set"
 
 
 BEST: Final = Variant()
@@ -36,12 +38,14 @@ PAPER: Final = Variant(
         batch_size=512,
     ),
     rounds=Rounds(num_tasks=60, executed_only=True),
+    network="paper",
 )
 _LEARNING: Final = BEST.learning
 _ROUNDS: Final = BEST.rounds
 VARIANTS: Final = {
     "best": BEST,
     "paper": PAPER,
+    "paper_network": replace(BEST, network="paper"),
     "no_hindsight": replace(BEST, learning=replace(_LEARNING, hindsight=0.0)),
     "no_double_q": replace(BEST, learning=replace(_LEARNING, double_q=False)),
     "no_symmetry": replace(BEST, learning=replace(_LEARNING, symmetry=False)),

@@ -155,7 +155,7 @@ def MakePolicy(
     from rhp_drake.planning.rescue import Rescued
     from rhp_drake.push_model.transition import PushModel
     from rhp_drake.resources import resolve
-    from rhp_drake.value.q_network import load_q_network
+    from rhp_drake.value.weights import load_q_network
 
     config.validate()
     if isinstance(config, OpenLoopConfig):

@@ -60,3 +60,16 @@ def features(states: torch.Tensor, goals: torch.Tensor) -> torch.Tensor:
     )
     centre = in_hand(states.new_tensor(_CENTRE) - hand[..., :2]).squeeze(1) / 3
     return torch.cat([centre, c, s, of_objects.flatten(1)], dim=-1)
+
+
+def object_points(of_objects: torch.Tensor) -> torch.Tensor:
+    """Positions and goals in H, over 0.1 m, of objects' features.
+
+    Args:
+        of_objects: Shape (..., OBJECT_FEATURES).
+
+    Returns:
+        Shape (..., 4).
+    """
+    positions, ways = of_objects[..., :2], of_objects[..., 5:7]
+    return torch.cat([positions, positions + ways], dim=-1)

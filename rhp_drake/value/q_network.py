@@ -1,59 +1,62 @@
-"""The Q-network of section VII-A, and its files.
+"""Q-networks: that of the paper, and one that sees the objects as a set."""
 
-A file is in the safetensors format, which cannot execute code; its metadata says
-what the weights are for and where they come from.
-"""
-
+from abc import ABC, abstractmethod
 from hashlib import sha256
 from itertools import pairwise
-import json
-from pathlib import Path
-from typing import Any, Final
+import math
+from typing import Any, ClassVar, Final
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 import torch
 from torch import nn
 
-from rhp_drake.errors import InputError
-from rhp_drake.files import write_atomically
 from rhp_drake.task import NUM_ACTIONS
-from rhp_drake.value.features import features, num_features
+from rhp_drake.value.features import (
+    HAND_FEATURES,
+    OBJECT_FEATURES,
+    features,
+    num_features,
+    object_points,
+)
 
 HIDDEN_LAYERS: Final = (330, 180, 80, 64)  # Section VII-A.
-_FORMAT: Final = "rhp_drake q_network 1"
+
+# Of the set network.
+_WIDTH: Final = 192
+# Wavelengths, in the features' unit of 0.1 m: from one action's way to four of them,
+# since by how much a push misses a box matters more than how far away it is.
+_WAVELENGTHS: Final = (4.0, 2.0, 1.0)
 
 
-class QNetwork(nn.Module):
+class QNetwork(nn.Module, ABC):
     """q(s, a; theta): expected return of each action, in the state, for the goals.
 
     Attributes:
-        num_objects: m, which the weights are for.
+        architecture: Its name, by which files tell networks apart.
+        num_objects: m.
+        any_number: Whether the same weights serve any m.
         provenance: How the weights came about: command, seeds, commit, metrics.
     """
+
+    architecture: ClassVar[str]
+    any_number: ClassVar[bool] = False
 
     def __init__(self, num_objects: int) -> None:
         super().__init__()
         self.num_objects = num_objects
         self.provenance: dict[str, Any] = {}
-        widths = [num_features(num_objects), *HIDDEN_LAYERS]
-        layers: list[nn.Module] = []
-        for inputs, outputs in pairwise(widths):
-            layers += [nn.Linear(inputs, outputs), nn.ReLU()]
-        layers.append(nn.Linear(widths[-1], NUM_ACTIONS))
-        self.layers = nn.Sequential(*layers)
 
     def __repr__(self) -> str:
         """Tells networks apart: by the SHA-256 of their weights."""
         digest = sha256()
         for tensor in self.state_dict().values():
             digest.update(tensor.cpu().contiguous().numpy().tobytes())
-        return f"QNetwork({self.num_objects}, sha256={digest.hexdigest()[:16]})"
+        name = type(self).__name__
+        return f"{name}({self.num_objects}, sha256={digest.hexdigest()[:16]})"
 
+    @abstractmethod
     def forward(self, states: torch.Tensor, goals: torch.Tensor) -> torch.Tensor:
         """Values (N, 6) for states (N, 3 + 3 m) and goals (N, m, 2)."""
-        return self.layers(features(states, goals))
 
     @torch.inference_mode()
     def values(self, states: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -62,44 +65,87 @@ class QNetwork(nn.Module):
         of_task = torch.as_tensor(goals, dtype=torch.float32)
         return self(batch, of_task.expand(len(batch), -1, -1)).double().numpy()
 
-    def save(self, path: Path) -> None:
-        """Writes the weights and their provenance."""
-        metadata = {
-            "format": _FORMAT,
-            "num_objects": str(self.num_objects),
-            "provenance": json.dumps(self.provenance),
-        }
-        tensors = {k: v.contiguous().cpu() for k, v in self.state_dict().items()}
-        write_atomically(path, save(tensors, metadata))
 
+class PaperQNetwork(QNetwork):
+    """The feed-forward network of section VII-A, for one number of objects."""
 
-def load_q_network(path: Path, num_objects: int) -> QNetwork:
-    """Reads a Q-network for `num_objects` objects.
+    architecture = "paper"
 
-    Raises:
-        InputError: If the file is missing, corrupt, or for another m.
-    """
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file of weights.") from error
-    except (SafetensorError, OSError) as error:
-        raise InputError(
-            f"{path}: not a readable file of weights ({error})."
-        ) from error
-    if metadata.get("format") != _FORMAT:
-        raise InputError(f"{path}: not the weights of a Q-network of this version.")
-    if metadata.get("num_objects") != str(num_objects):
-        raise InputError(
-            f"{path}: the weights are for {metadata.get('num_objects')} objects, not "
-            f"{num_objects}."
+    def __init__(self, num_objects: int) -> None:
+        super().__init__(num_objects)
+        widths = [num_features(num_objects), *HIDDEN_LAYERS]
+        self.layers = nn.Sequential(
+            *_hidden(widths), nn.Linear(widths[-1], NUM_ACTIONS)
         )
-    network = QNetwork(num_objects)
-    try:
-        network.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise InputError(f"{path}: the weights have the wrong shapes.") from error
-    network.provenance = json.loads(metadata.get("provenance", "{}"))
-    return network.eval()
+
+    def forward(self, states: torch.Tensor, goals: torch.Tensor) -> torch.Tensor:
+        """See `QNetwork`."""
+        return self.layers(features(states, goals))
+
+
+class SetQNetwork(QNetwork):
+    """A network for any number of obstacles, in whatever order they are listed.
+
+    One encoder sees hand and target, another one hand, target and an obstacle, each
+    obstacle in turn.  A head turns the sum of all codes into values (Zaheer et al.,
+    Deep Sets, 2017).  Positions enter also as their sines and cosines (Tancik et al.
+    2020): values change much within a centimetre where a finger just misses a box.
+    """
+
+    architecture = "set"
+    any_number = True
+
+    def __init__(self, num_objects: int) -> None:
+        super().__init__(num_objects)
+        of_object = OBJECT_FEATURES + 4 * 2 * len(_WAVELENGTHS)
+        of_pair = 3  # The obstacle's position from the target, and its distance.
+        target = HAND_FEATURES + of_object
+        widths = (_WIDTH, _WIDTH)
+        self.target_encoder = nn.Sequential(*_hidden([target, *widths]))
+        self.obstacle_encoder = nn.Sequential(
+            *_hidden([target + of_object + of_pair, *widths])
+        )
+        self.head = nn.Sequential(
+            *_hidden([_WIDTH, _WIDTH]), nn.Linear(_WIDTH, NUM_ACTIONS)
+        )
+
+    def forward(self, states: torch.Tensor, goals: torch.Tensor) -> torch.Tensor:
+        """See `QNetwork`."""
+        hand, of_objects = features(states, goals).tensor_split([HAND_FEATURES], dim=1)
+        objects = of_objects.unflatten(1, (-1, OBJECT_FEATURES))
+        points = object_points(objects)
+        waves = [
+            wave(2 * math.pi / length * points)
+            for length in _WAVELENGTHS
+            for wave in (torch.sin, torch.cos)
+        ]
+        target, obstacles = torch.cat([objects, *waves], dim=-1).tensor_split(
+            [1], dim=1
+        )
+        hand_and_target = torch.cat([hand[:, None], target], dim=-1)
+        ways = obstacles[..., :2] - target[..., :2]
+        pairs = torch.cat(
+            [
+                hand_and_target.expand(-1, obstacles.shape[1], -1),
+                obstacles,
+                ways,
+                torch.linalg.vector_norm(ways, dim=-1, keepdim=True),
+            ],
+            dim=-1,
+        )
+        codes = self.target_encoder(hand_and_target).squeeze(1)
+        return self.head(codes + self.obstacle_encoder(pairs).sum(dim=1))
+
+
+def _hidden(widths: list[int]) -> list[nn.Module]:
+    """Layers of these widths, each with its rectifier."""
+    return [
+        layer
+        for inputs, outputs in pairwise(widths)
+        for layer in (nn.Linear(inputs, outputs), nn.ReLU())
+    ]
+
+
+ARCHITECTURES: Final[dict[str, type[QNetwork]]] = {
+    network.architecture: network for network in (PaperQNetwork, SetQNetwork)
+}
