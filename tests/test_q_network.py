@@ -9,7 +9,7 @@ from rhp_drake.errors import InputError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import NUM_ACTIONS, sample_instance
 from rhp_drake.value.features import HAND_FEATURES, features, num_features
-from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.q_network import ARCHITECTURES, SetQNetwork
 from rhp_drake.value.weights import load_q_network, save_q_network
 
 PROVENANCE = {
@@ -29,10 +29,10 @@ def scenes():
     )
 
 
-@pytest.fixture
-def network():
+@pytest.fixture(params=ARCHITECTURES)
+def network(request):
     torch.manual_seed(0)
-    network = PaperQNetwork(3)
+    network = ARCHITECTURES[request.param](3)
     network.provenance = PROVENANCE
     return network
 
@@ -87,13 +87,25 @@ def message_of(path, num_objects=3) -> str:
 def test_bad_files(path, tmp_path):
     assert "no such file" in message_of(tmp_path / "missing.safetensors")
     assert "not a readable file" in message_of(tmp_path)
-    assert "the weights are for 3 objects, not 2." in message_of(path, num_objects=2)
     data = path.read_bytes()
     for broken in (b"", b"not weights", data[: len(data) // 2]):
         path.write_bytes(broken)
         assert "not a readable file" in message_of(path)
     save_file({"layers.0.weight": torch.zeros(2)}, path)
     assert "not the weights of a Q-network" in message_of(path)
+
+
+def test_number_of_objects(network, path):
+    if network.any_number:
+        assert load_q_network(path, 2).num_objects == 2
+    else:
+        assert "are for 3 objects, not 2." in message_of(path, num_objects=2)
+
+
+def test_unknown_architecture(path):
+    metadata = {"format": "rhp_drake q_network 1", "architecture": "cubist"}
+    save_file({"layers.0.weight": torch.zeros(2)}, path, metadata)
+    assert "an unknown network, 'cubist'" in message_of(path)
 
 
 def test_weights_of_wrong_shape(path):
@@ -122,3 +134,29 @@ def test_features_know_that_boxes_are_square(scenes):
     torch.testing.assert_close(features(turned, goals), features(states, goals))
     turned[:, 5] += 0.3
     assert not torch.allclose(features(turned, goals), features(states, goals))
+
+
+def test_obstacles_are_a_set(scenes):
+    """Their order does not matter, to the set network, nor their number."""
+    torch.manual_seed(0)
+    network = SetQNetwork(3)
+    states, goals = (x.float() for x in scenes)
+    expected = network(states, goals)
+    order = [0, 2, 1]
+    poses = states.unflatten(1, (-1, 3))
+    swapped = torch.cat([poses[:, :1], poses[:, 1:][:, order]], dim=1).flatten(1)
+    torch.testing.assert_close(network(swapped, goals[:, order]), expected)
+    # The target is none of them.
+    order = [1, 0, 2]
+    swapped = torch.cat([poses[:, :1], poses[:, 1:][:, order]], dim=1).flatten(1)
+    assert not torch.allclose(network(swapped, goals[:, order]), expected)
+    for m in (1, 2, 3):
+        assert network(states[:, : 3 + 3 * m], goals[:, :m]).shape == expected.shape
+
+
+@pytest.mark.parametrize("m", [1, 2, 5])
+def test_set_network_for_any_number_of_objects(m):
+    torch.manual_seed(0)
+    instance = sample_instance(stream(0, "test", m), m)
+    values = SetQNetwork(m).values(instance.initial_state[None], instance.goals)
+    assert np.isfinite(values).all()

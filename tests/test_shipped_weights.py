@@ -35,7 +35,7 @@ def test_rhp_solves_nearly_all_and_more_than_imitation_does_greedily():
     assert successes(GreedyConfig(q_network=imitation), 20) < 20
 
 
-@pytest.mark.parametrize("name", ["imitation", "paper", "best"])
+@pytest.mark.parametrize("name", ["imitation", "imitation_set", "paper", "best"])
 def test_weights_are_small_and_say_where_they_come_from(name):
     path = models_path() / f"q_network/{name}.safetensors"
     assert path.stat().st_size < 1_000_000

@@ -23,9 +23,8 @@ HIDDEN_LAYERS: Final = (330, 180, 80, 64)  # Section VII-A.
 
 # Of the set network.
 _WIDTH: Final = 192
-# Wavelengths, in the features' unit of 0.1 m: from one action's way to four of them,
-# since by how much a push misses a box matters more than how far away it is.
-_WAVELENGTHS: Final = (4.0, 2.0, 1.0)
+# Wavelengths, in the features' unit of 0.1 m: from one action's way to sixteen of them.
+_WAVELENGTHS: Final = (8.0, 4.0, 2.0, 1.0, 0.5)
 
 
 class QNetwork(nn.Module, ABC):
