@@ -53,7 +53,7 @@ def test_bundled(path):
     name, scenario = load_scenario(path)
     assert name == path.stem
     instance = make_task_instance(scenario)
-    assert instance.num_objects == 3
+    assert instance.num_objects == len(scenario.station.objects)
     assert not overlapping_bodies(instance.initial_state)
     assert not goals_reached(instance.initial_state, instance.goals)
     assert load_scenario(path.stem)[0] == name

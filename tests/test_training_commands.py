@@ -162,6 +162,7 @@ def tiny_variants(plans, monkeypatch):
                 learning=FittedQConfig(**learning),
                 rounds=Rounds(**rounds),
                 from_scratch=variant.from_scratch,
+                network=variant.network,
             ),
         )
     monkeypatch.setattr(bench, "SHIPPED_PLANS", plans)

@@ -194,7 +194,7 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
     network.provenance = {
         "commit": trainings.commit,
         **asdict(training),
-        **asdict(variant.rounds),
+        "rounds": asdict(variant.rounds),
         **asdict(config),
         "curve": result.curve,
         "rhp33": result.rhp33,

@@ -95,6 +95,29 @@ class GuidedDemonstrator:
         return _demonstration(self.seed, task, instance, found)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Acting:
+    """How epsilon-RHP acts, and what is kept of it.
+
+    Attributes:
+        epsilon: How often the action is a random one.
+        temperature: tau of Eq. 5, in actions.
+        num_roll_outs: n.
+        horizon: h; 0 makes it epsilon-greedy.
+        uncertainty: Of the physics in which it acts, which RHP does not know.
+        num_searches: From how many states of an episode it searches, best first.
+        executed_only: Whether nothing but what was executed is kept.
+    """
+
+    epsilon: float = 0.1
+    temperature: float = 0.5
+    num_roll_outs: int = 6
+    horizon: int = 6
+    uncertainty: str = "none"
+    num_searches: int = 0
+    executed_only: bool = False
+
+
 @dataclass(frozen=True)
 class RecedingHorizonDemonstrator:
     """Acts by epsilon-RHP (section V of the paper).
@@ -107,24 +130,12 @@ class RecedingHorizonDemonstrator:
     Attributes:
         seed: Of the tasks and the policy.
         q_network: RHP's; its m is that of the tasks.
-        epsilon: How often the action is a random one.
-        temperature: tau of Eq. 5, in actions.
-        num_roll_outs: n.
-        horizon: h; 0 makes it epsilon-greedy.
-        uncertainty: Of the physics in which it acts, which RHP does not know.
-        num_searches: From how many states of an episode it searches, best first.
-        executed_only: Whether it keeps nothing but what was executed.
+        acting: How.
     """
 
     seed: int
     q_network: QNetwork
-    epsilon: float = 0.1
-    temperature: float = 0.5
-    num_roll_outs: int = 6
-    horizon: int = 6
-    uncertainty: str = "none"
-    num_searches: int = 0
-    executed_only: bool = False
+    acting: Acting = Acting()
 
     @property
     def num_objects(self) -> int:
@@ -140,9 +151,9 @@ class RecedingHorizonDemonstrator:
         return RecedingHorizon(
             self._recorder,
             self.q_network,
-            self.num_roll_outs,
-            self.horizon,
-            self.temperature,
+            self.acting.num_roll_outs,
+            self.acting.horizon,
+            self.acting.temperature,
         )
 
     def demonstrate(self, task: int) -> Demonstration:
@@ -150,7 +161,7 @@ class RecedingHorizonDemonstrator:
         begin = time.perf_counter()
         instance = training_task(self.seed, task, self.num_objects)
         physics = draw_physics(
-            self.uncertainty,
+            self.acting.uncertainty,
             instance.initial_state,
             stream(self.seed, TRAINING, task, "world_physics"),
         )
@@ -159,7 +170,7 @@ class RecedingHorizonDemonstrator:
         seconds = time.perf_counter() - begin
         search = (
             chain(np.array(states), np.array(actions, int))
-            if self.executed_only
+            if self.acting.executed_only
             else self._recorder.search()
         )
         if goals_reached(states[-1], instance.goals):
@@ -177,7 +188,7 @@ class RecedingHorizonDemonstrator:
         self._recorder.forget()
         states, actions = [state], []
         for _ in range(MAX_ACTIONS):
-            explores = generator.random() < self.epsilon
+            explores = generator.random() < self.acting.epsilon
             try:
                 decision = self._policy.decide(state, goals, generator)
                 action = decision.action
@@ -198,7 +209,7 @@ class RecedingHorizonDemonstrator:
     def _search(self, states: list[np.ndarray], goals: np.ndarray, task: int) -> None:
         """Searches from some of the states; the recorder notes what is simulated."""
         generator = stream(self.seed, TRAINING, task, "searched_states")
-        count = min(self.num_searches, len(states))
+        count = min(self.acting.num_searches, len(states))
         for index in generator.choice(len(states), count, replace=False):
             with suppress(PushModelError):
                 plan_best_first(

@@ -24,7 +24,7 @@ from rhp_drake.learning.dataset import (
     without_oldest,
 )
 from rhp_drake.learning.demonstration_folder import demonstrate_tasks
-from rhp_drake.learning.demonstrators import RecedingHorizonDemonstrator
+from rhp_drake.learning.demonstrators import Acting, RecedingHorizonDemonstrator
 from rhp_drake.learning.fitted_q import FittedQ
 from rhp_drake.workers import Workers
 
@@ -39,24 +39,12 @@ class Rounds:
     Attributes:
         num_tasks: On which RHP acts in a round.
         num_steps: Gradient steps of a round.
-        epsilon: How often RHP's action is a random one.
-        temperature: tau of Eq. 5.
-        num_roll_outs: n.
-        horizon: h.
-        uncertainty: Of the physics in which RHP acts; it does not know them.
-        num_searches: From how many states of each task better ways are searched.
-        executed_only: Whether roll-outs and searches are not learned from.
+        acting: How RHP acts.
     """
 
     num_tasks: int = 100
     num_steps: int = 1000
-    epsilon: float = 0.1
-    temperature: float = 0.5
-    num_roll_outs: int = 6
-    horizon: int = 6
-    uncertainty: str = "none"
-    num_searches: int = 0
-    executed_only: bool = False
+    acting: Acting = Acting()
 
 
 class Reinforcement:
@@ -126,7 +114,7 @@ class Reinforcement:
 
     def _replay_buffer(self) -> list[Dataset]:
         experience = concatenate(self._experience)
-        if not self.rounds.executed_only:
+        if not self.rounds.acting.executed_only:
             return [*self._demonstrations, experience]
         both = concatenate([*self._demonstrations, experience])
         return [without_oldest(both, len(experience.search_actions))]
@@ -140,13 +128,7 @@ class Reinforcement:
             self._seed,
             # The network goes on learning.
             deepcopy(self._learner.network),
-            epsilon=self.rounds.epsilon,
-            temperature=self.rounds.temperature,
-            num_roll_outs=self.rounds.num_roll_outs,
-            horizon=self.rounds.horizon,
-            uncertainty=self.rounds.uncertainty,
-            num_searches=self.rounds.num_searches,
-            executed_only=self.rounds.executed_only,
+            self.rounds.acting,
         )
         yield from demonstrate_tasks(
             self._round(index),

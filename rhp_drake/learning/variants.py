@@ -1,8 +1,9 @@
 """How reinforcement learning is done: ours, the paper's, and ours but for one thing."""
 
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
+from rhp_drake.learning.demonstrators import Acting
 from rhp_drake.learning.fitted_q import FittedQConfig
 from rhp_drake.learning.reinforcement import Rounds
 
@@ -24,6 +25,11 @@ class Variant:
     network: str = "set"
 
 
+def _acting(**changes: Any) -> Rounds:
+    """The default rounds, but for how RHP acts."""
+    return Rounds(acting=Acting(**changes))
+
+
 BEST: Final = Variant()
 # Section V: Q-learning on plans and on what was executed, squared errors, a gradient
 # step for each action (an episode has some 16).  The loss of imitation stays, which the
@@ -37,11 +43,10 @@ PAPER: Final = Variant(
         imitation_weight=0.1,
         batch_size=512,
     ),
-    rounds=Rounds(num_tasks=60, executed_only=True),
+    rounds=Rounds(num_tasks=60, acting=Acting(executed_only=True)),
     network="paper",
 )
 _LEARNING: Final = BEST.learning
-_ROUNDS: Final = BEST.rounds
 VARIANTS: Final = {
     "best": BEST,
     "paper": PAPER,
@@ -49,10 +54,10 @@ VARIANTS: Final = {
     "no_hindsight": replace(BEST, learning=replace(_LEARNING, hindsight=0.0)),
     "no_double_q": replace(BEST, learning=replace(_LEARNING, double_q=False)),
     "no_symmetry": replace(BEST, learning=replace(_LEARNING, symmetry=False)),
-    "executed_only": replace(BEST, rounds=replace(_ROUNDS, executed_only=True)),
-    "epsilon_greedy": replace(BEST, rounds=replace(_ROUNDS, horizon=0)),
-    "uncertain_physics": replace(BEST, rounds=replace(_ROUNDS, uncertainty="high")),
-    "searches": replace(BEST, rounds=replace(_ROUNDS, num_searches=3)),
+    "executed_only": replace(BEST, rounds=_acting(executed_only=True)),
+    "epsilon_greedy": replace(BEST, rounds=_acting(horizon=0)),
+    "uncertain_physics": replace(BEST, rounds=_acting(uncertainty="high")),
+    "searches": replace(BEST, rounds=_acting(num_searches=3)),
     "search_returns": replace(BEST, learning=replace(_LEARNING, search_returns=True)),
     "from_scratch": replace(BEST, from_scratch=True),
 }
