@@ -1,9 +1,11 @@
-"""The frozen sets of task instances: for evaluation, and for tuning.
+"""The sets of task instances: for evaluation, and for tuning.
 
-They are stored rather than drawn anew, so that a change of the sampling cannot change
-them.  Training draws from other streams (`random_streams`): it never meets them.
+Those of three objects, as in the paper, are stored rather than drawn anew, so that a
+change of the sampling cannot change them.  Training draws from other streams
+(`random_streams`): it never meets them.
 """
 
+from functools import cache
 import io
 from pathlib import Path
 from typing import Final
@@ -22,17 +24,20 @@ _SEED: Final = 0
 _FOLDER: Final = Path(__file__).resolve().parent / "data"
 
 
-def load_instances(name: str) -> list[TaskInstance]:
-    """The 500 instances, of three objects each, of a set.
+def load_instances(name: str, num_objects: int = NUM_OBJECTS) -> list[TaskInstance]:
+    """The 500 instances of a set.
 
     Args:
         name: "evaluation", which nothing may be tuned on, or "validation".
+        num_objects: m; each has a set of its own.
 
     Raises:
         InputError: If there is no such set.
     """
     if name not in SETS:
         raise InputError(f"{name!r} is not a set of instances: {', '.join(SETS)}.")
+    if num_objects != NUM_OBJECTS:
+        return list(_draw_instances(name, num_objects))
     with np.load(_FOLDER / f"{name}.npz", allow_pickle=False) as arrays:
         return [
             TaskInstance(state, goals)
@@ -40,6 +45,14 @@ def load_instances(name: str) -> list[TaskInstance]:
                 arrays["initial_states"], arrays["goals"], strict=True
             )
         ]
+
+
+@cache
+def _draw_instances(name: str, num_objects: int) -> tuple[TaskInstance, ...]:
+    return tuple(
+        sample_instance(stream(_SEED, name, "objects", num_objects, i), num_objects)
+        for i in range(SET_SIZE)
+    )
 
 
 def freeze_instances(name: str, folder: Path = _FOLDER) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from rhp_drake import task, typed_yaml
 from rhp_drake.errors import InputError
-from rhp_drake.frozen_instances import NUM_OBJECTS, SET_SIZE, SETS, load_instances
+from rhp_drake.frozen_instances import SET_SIZE, SETS, load_instances
 from rhp_drake.physics import UNCERTAINTY_LEVELS
 from rhp_drake.planning.policy_config import PolicyConfig, RecedingHorizonConfig
 from rhp_drake.random_streams import TRAINING, VALIDATION, stream
@@ -60,7 +60,7 @@ class SampledInstance:
     """A task drawn at random, as section VII-A of the paper does.
 
     Attributes:
-        set: "training", which has no end, or one of the frozen sets of 500 tasks,
+        set: "training", which has no end, or one of the sets of 500 tasks,
             "validation" and "evaluation".  They never share a task.
         index: Which task of the set; null for the scenario's seed.
     """
@@ -200,9 +200,7 @@ def make_task_instance(scenario: Scenario) -> task.TaskInstance:
         return task.sample_instance(stream(0, TRAINING, index), num_objects)
     wanted = f"below {SET_SIZE}, the size of the {config.set} set"
     _check(index < SET_SIZE, "task.index (or seed)", index, wanted)
-    wanted = f"training or a !Layout unless there are {NUM_OBJECTS} objects"
-    _check(num_objects == NUM_OBJECTS, "task.set", config.set, wanted)
-    return load_instances(config.set)[index]
+    return load_instances(config.set, num_objects)[index]
 
 
 def _layout_instance(layout: Layout, num_objects: int) -> task.TaskInstance:

@@ -57,6 +57,7 @@ def test_each_command_has_help(command, monkeypatch, capsys):
         (["--instances", "training"], "'training' is not a set of instances: "),
         (["--count", "0"], "0 instances were asked for; the validation set has 500."),
         (["--count", "501"], "501 instances were asked for; the validation set has"),
+        (["--objects", "5", "--world", "station"], "the station has 3 objects, not 5."),
         (["--world", "moon"], "'moon' is not a world: planar, station."),
         (
             ["--temperature", "0"],

@@ -145,10 +145,6 @@ def test_expanded_scenario_loads_again(tmp_path):
         ("a: {task: {set: test}}", ": a: task.set: must be one of training, validat"),
         ("a: {task: {index: -1}}", ": a: task.index: must be at least 0, not -1."),
         ("a: {seed: 500}", ": a: task.index (or seed): must be below 500, the size of"),
-        (
-            "a: {station: {objects: [target]}}",
-            ": a: task.set: must be training or a !Layout unless there are 3 objects",
-        ),
         ("a: {visualization: {camera: [1]}}", ": a: visualization.camera: must be t"),
         ("a: [", ", line 1: not valid YAML: "),
         ("", ": expected a mapping of names to values."),

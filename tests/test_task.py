@@ -105,6 +105,19 @@ def test_frozen_sets_are_what_their_streams_draw_and_never_meet():
     assert len(set(starts)) == 3 * SET_SIZE
 
 
+def test_sets_for_other_numbers_of_objects():
+    five = load_instances(EVALUATION, 5)
+    assert len(five) == SET_SIZE
+    assert {instance.num_objects for instance in five} == {5}
+    first = [
+        tuple(load_instances(name, 5)[0].initial_state)
+        for name in (EVALUATION, VALIDATION)
+    ]
+    assert first[0] != first[1]
+    again = load_instances(EVALUATION, 5)[499].initial_state
+    np.testing.assert_array_equal(again, five[499].initial_state)
+
+
 def test_streams_depend_on_seed_and_path_alone():
     def draw(*path):
         return stream(*path).random(4).tolist()

@@ -27,6 +27,9 @@ def evaluate(
     instances: Annotated[
         str, typer.Option(help="The set: evaluation (never tune on it) or validation.")
     ] = "validation",
+    objects: Annotated[
+        int, typer.Option(min=1, max=8, help="Of each instance, the target included.")
+    ] = 3,
     count: Annotated[int, typer.Option(help="The first so many of the set.")] = 500,
     world: Annotated[
         str, typer.Option(help="planar, the push model, or station, the whole robot.")
@@ -56,12 +59,14 @@ def evaluate(
     )
     from rhp_drake.evaluation.machine import describe_machine
     from rhp_drake.files import check_writable
+    from rhp_drake.frozen_instances import NUM_OBJECTS
 
     comparison = Comparison(
         {name: _config(name, weights, temperature) for name in policies.split(",")},
         # A level named twice would count each of its episodes twice.
         list(dict.fromkeys(levels.split(","))),
         instances,
+        objects,
         count,
         world,
         seed,
@@ -81,9 +86,11 @@ def evaluate(
         ),
     )
     title = f"{world} world, first {count} instances of the {instances} set"
+    if objects != NUM_OBJECTS:
+        title += f", {objects} objects"
     if len(comparison.levels) == 1:
         title += f", uncertainty: {comparison.levels[0]}"
-    tables = [make_table(results, title)]
+    tables = [make_table(results, title, objects)]
     if not all(episode.succeeded for _, episode in results):
         tables.append(make_failure_table(results))
         tables.append(make_ending_table(results, _NUM_ENDINGS))

@@ -122,5 +122,4 @@ def _train(
                 writer.add_scalar("loss", loss, step)
             if step % _VALIDATION_PERIOD == 0 and step < total:
                 successes, trials = greedy_successes(learner.network)
-                if trials:
-                    writer.add_scalar("greedy success", successes / trials, step)
+                writer.add_scalar("greedy success", successes / trials, step)

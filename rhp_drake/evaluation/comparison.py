@@ -12,7 +12,7 @@ from rich.table import Table
 from rhp_drake.errors import InputError
 from rhp_drake.evaluation.episode import Episode, PushWorld, run_episode
 from rhp_drake.evaluation.statistics import format_rate
-from rhp_drake.frozen_instances import load_instances
+from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
 from rhp_drake.physics import UNCERTAINTY_LEVELS, ObjectPhysics, draw_physics
 from rhp_drake.planning.policy_config import MakePolicy, PolicyConfig
 from rhp_drake.push_model.transition import PushModel
@@ -56,6 +56,7 @@ class Comparison:
         policies: By their names in the table.
         levels: Of the physics' uncertainty, any of `UNCERTAINTY_LEVELS`.
         instances: Name of a set of instances.
+        num_objects: Of each instance.
         num_instances: The first so many of the set.
         world: "planar", the push model, or "station", the whole robot.
         seed: Of the policies' random draws, and of the physics.
@@ -64,6 +65,7 @@ class Comparison:
     policies: dict[str, PolicyConfig]
     levels: Sequence[str]
     instances: str
+    num_objects: int
     num_instances: int
     world: str
     seed: int
@@ -75,7 +77,11 @@ class Comparison:
             if level not in UNCERTAINTY_LEVELS:
                 known = ", ".join(UNCERTAINTY_LEVELS)
                 raise InputError(f"{level!r} is not a level of uncertainty: {known}.")
-        available = len(load_instances(self.instances))
+        if self.num_objects != NUM_OBJECTS and self.world == STATION:
+            raise InputError(
+                f"the station has {NUM_OBJECTS} objects, not {self.num_objects}."
+            )
+        available = len(load_instances(self.instances, self.num_objects))
         if not 1 <= self.num_instances <= available:
             raise InputError(
                 f"{self.num_instances} instances were asked for; the {self.instances} "
@@ -117,7 +123,7 @@ def _make_runner(config: PolicyConfig, world: str, num_objects: int) -> _Runner:
 
 def _run_trial(trial: Trial, comparison: Comparison) -> Episode:
     config, world = comparison.policies[trial.policy], comparison.world
-    instance = load_instances(comparison.instances)[trial.index]
+    instance = load_instances(comparison.instances, comparison.num_objects)[trial.index]
     key = f"{world} {config!r}"
     if key not in _runners:
         _runners[key] = _make_runner(config, world, instance.num_objects)
@@ -142,13 +148,15 @@ def run_comparison(
 _Results: TypeAlias = Sequence[tuple[Trial, Episode]]
 
 
-def make_table(results: _Results, title: str) -> Table:
+def make_table(results: _Results, title: str, num_objects: int = NUM_OBJECTS) -> Table:
     """A table of success and cost, a row a policy and level.
 
-    Beside the success stands what the paper's imitation columns say of the policy.
+    Beside the success stands what the paper's imitation columns say of the policy, if
+    there are as many objects.
     Actions and computation are means over the runs that succeeded; the last number,
     where time flows, is simulated time over the world's own computation.
     """
+    paper = PAPER_SUCCESS if num_objects == NUM_OBJECTS else {}
     time_flows = any(episode.simulated_seconds for _, episode in results)
     headings = [
         "success %\n(95 % Wilson)",
@@ -166,7 +174,7 @@ def make_table(results: _Results, title: str) -> Table:
         p50, p95 = 1e3 * np.percentile(seconds or [np.nan], [50, 95])
         row = [
             format_rate(len(successes), len(episodes)),
-            str(PAPER_SUCCESS.get(policy, {}).get(level, "")),
+            str(paper.get(policy, {}).get(level, "")),
             f"{_mean([e.num_actions for e in successes]):.1f}",
             f"{_format_ms(p50)} / {_format_ms(p95)}",
             f"{_mean([sum(e.decision_seconds) for e in successes]):.2f}",

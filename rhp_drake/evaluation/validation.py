@@ -11,12 +11,7 @@ _NUM_TASKS: Final = 200
 
 
 def greedy_successes(network: QNetwork) -> tuple[int, int]:
-    """How many of some validation tasks the greedy policy solves, and of how many.
-
-    There are frozen tasks for three objects only: of none otherwise.
-    """
-    instances = load_instances(VALIDATION)[:_NUM_TASKS]
-    if network.num_objects != instances[0].num_objects:
-        return 0, 0
+    """How many of some validation tasks the greedy policy solves, and of how many."""
+    instances = load_instances(VALIDATION, network.num_objects)[:_NUM_TASKS]
     episodes = greedy_episodes(network, instances)
     return sum(episode.succeeded for episode in episodes), len(instances)
