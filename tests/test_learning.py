@@ -11,7 +11,7 @@ from rhp_drake.learning.augmentation import Symmetry
 from rhp_drake.learning.dataset import load_dataset
 from rhp_drake.learning.demonstration_folder import demonstrate_tasks
 from rhp_drake.learning.demonstrators import PlanningDemonstrator
-from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, double_q_targets, sample
+from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig, double_q_targets
 from rhp_drake.learning.imitation import (
     Imitation,
     ImitationConfig,
@@ -19,6 +19,7 @@ from rhp_drake.learning.imitation import (
     return_of,
 )
 from rhp_drake.learning.reinforcement import Reinforcement, Rounds
+from rhp_drake.learning.sampling import sample
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
@@ -97,7 +98,7 @@ def test_double_q_targets_by_hand():
 
 def test_hindsight_goals_are_reached_in_time(data):
     """Following the search from a sample to its end meets the goals it was given."""
-    samples = sample([data], FittedQConfig(batch_size=4000), stream(1))
+    samples = sample([data], 4000, stream(1), hindsight=0.5)
     known = np.isfinite(samples.least_returns)
     assert known.mean() > 0.05
     # One action is enough where the least return says so.
@@ -113,9 +114,8 @@ def test_hindsight_goals_are_reached_in_time(data):
 
 
 def test_simulated_ways_to_the_goal_bound_the_values(data):
-    config = FittedQConfig(batch_size=4000, hindsight=0.0)
-    assert not np.isfinite(sample([data], config, stream(1)).least_returns).any()
-    bounded = sample([data], replace(config, search_returns=True), stream(1))
+    assert not np.isfinite(sample([data], 4000, stream(1)).least_returns).any()
+    bounded = sample([data], 4000, stream(1), search_returns=True)
     known = np.isfinite(bounded.least_returns)
     assert 0.01 < known.mean() < 1
     one = bounded.least_returns == -1

@@ -1,18 +1,12 @@
-"""Fitted Q: double Q-learning on simulated transitions, with goals in hindsight.
+"""Fitted Q: double Q-learning on simulated transitions.
 
-A transition of the push model is true whatever the goals are.  So every action that a
-search ever simulated teaches the value of any task in which its state may occur.  The
-goals of a sample are those of its task, or, in hindsight (Andrychowicz et al. 2017),
-places where things went some actions later in the same search; the search then shows
-that the goal can be reached in so many actions, a lower bound of the value (He et al.
-2017).  Else the update is Eq. 4 of the paper, with a target network and double
-Q-learning (van Hasselt et al. 2016).
+The update is Eq. 4 of the paper, with a target network and double Q-learning (van
+Hasselt et al. 2016), bounded from below by returns that a search is known to reach.
 """
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, fields
-from typing import Final
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,21 +17,15 @@ from rhp_drake.learning.augmentation import NoSymmetry, Symmetry
 from rhp_drake.learning.dataset import Dataset
 from rhp_drake.learning.imitation import ImitationConfig, Plans
 from rhp_drake.learning.learner import Learner
+from rhp_drake.learning.sampling import Samples, sample
 from rhp_drake.task import (
-    GOAL_RADIUS,
     MAX_ACTIONS,
     REWARD,
     allowed_actions,
     goals_reached,
-    object_positions,
     objects_fallen,
 )
 from rhp_drake.value.q_network import QNetwork
-
-# Hindsight looks at most this many actions ahead.
-_FORESIGHT: Final = 20
-# m: a target that moved less teaches nothing about pushing it.
-_LEAST_MOTION: Final = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,96 +59,6 @@ class FittedQConfig:
     symmetry: bool = True
     squared_errors: bool = False
     imitation_weight: float = 0.0
-
-
-@dataclass(frozen=True)
-class Samples:
-    """N transitions with the goals they are looked at for.
-
-    Attributes:
-        states: Shape (N, 3 + 3 m).
-        actions: Shape (N,).
-        next_states: Shape (N, 3 + 3 m).
-        goals: Shape (N, m, 2).
-        least_returns: What the return is known to reach at least, shape (N,).
-    """
-
-    states: np.ndarray
-    actions: np.ndarray
-    next_states: np.ndarray
-    goals: np.ndarray
-    least_returns: np.ndarray
-
-
-def _in_disc(centres: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Points uniform in the discs of radius `GOAL_RADIUS` around (..., 2) centres."""
-    shape = centres.shape[:-1]
-    radius = GOAL_RADIUS * np.sqrt(generator.random(shape))
-    angle = 2 * np.pi * generator.random(shape)
-    return centres + np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
-
-
-def sample(
-    sources: Sequence[Dataset], config: FittedQConfig, generator: np.random.Generator
-) -> Samples:
-    """Draws a batch of transitions and their goals, as many from each source."""
-    num_samples = config.batch_size
-    shares = np.diff(np.arange(len(sources) + 1) * num_samples // len(sources))
-    parts = [
-        _sample(source, int(share), config, generator)
-        for source, share in zip(sources, shares, strict=True)
-    ]
-    return Samples(
-        **{
-            field.name: np.concatenate([getattr(part, field.name) for part in parts])
-            for field in fields(Samples)
-        }
-    )
-
-
-def _sample(
-    data: Dataset,
-    num_samples: int,
-    config: FittedQConfig,
-    generator: np.random.Generator,
-) -> Samples:
-    num_hindsight = int(config.hindsight * num_samples)
-    rows = generator.integers(len(data.search_actions), size=num_samples)
-    goals = data.goals[data.search_tasks[rows]]
-
-    # The first of them in hindsight: `ends` is where the goals come from, `rows` a
-    # transition on the way there, `num_actions` of them before the end.
-    ends = rows[:num_hindsight].copy()
-    num_actions = np.ones(num_hindsight, dtype=int)
-    wanted = generator.integers(1, _FORESIGHT + 1, size=num_hindsight)
-    for _ in range(_FORESIGHT - 1):
-        origins = data.search_origins[rows[:num_hindsight]]
-        back = (num_actions < wanted) & (origins >= 0)
-        rows[:num_hindsight][back] = origins[back]
-        num_actions[back] += 1
-    least = np.full(num_samples, -np.inf)
-    if config.search_returns:
-        left = data.search_actions_left[rows]
-        least[left > 0] = REWARD * left[left > 0]
-    start = object_positions(data.search_states[rows[:num_hindsight]])
-    end = object_positions(data.search_next_states[ends])
-    moved = np.linalg.norm(end[:, 0] - start[:, 0], axis=1) > _LEAST_MOTION
-    found = _in_disc(end, generator)
-    # An obstacle still in its task's region needs no other one.
-    of_task = goals[:num_hindsight]
-    kept = np.linalg.norm(end - of_task, axis=-1) <= GOAL_RADIUS
-    kept[:, 0] = False
-    found = np.where(kept[..., None], of_task, found)
-    moved &= ~objects_fallen(data.search_next_states[ends])
-    goals[:num_hindsight][moved] = found[moved]
-    least[:num_hindsight][moved] = REWARD * num_actions[moved]
-    return Samples(
-        data.search_states[rows],
-        data.search_actions[rows],
-        data.search_next_states[rows],
-        goals,
-        least,
-    )
 
 
 def double_q_targets(
@@ -236,39 +134,49 @@ class FittedQ(Learner):
                 ours.lerp_(theirs, self._config.target_rate)
 
     def _loss(self) -> torch.Tensor:
-        config, network = self._config, self.network
-        batch = sample(self.sources, config, self._generator)
-        reached = torch.from_numpy(goals_reached(batch.next_states, batch.goals))
-        fallen = torch.from_numpy(objects_fallen(batch.next_states))
-        allowed = torch.from_numpy(allowed_actions(batch.next_states))
-        # An episode ends at the goal: nobody asks for values there.
-        asked = torch.from_numpy(~goals_reached(batch.states, batch.goals))
-
+        config = self._config
+        batch = sample(
+            self.sources,
+            config.batch_size,
+            self._generator,
+            hindsight=config.hindsight,
+            search_returns=config.search_returns,
+        )
         symmetry = (
-            Symmetry(len(asked), network.num_objects, self._generator)
+            Symmetry(config.batch_size, self.network.num_objects, self._generator)
             if config.symmetry
             else NoSymmetry()
         )
         goals = symmetry.goals(torch.from_numpy(batch.goals).float())
         states = symmetry.states(torch.from_numpy(batch.states))
-        next_states = symmetry.states(torch.from_numpy(batch.next_states))
         actions = symmetry.actions(torch.from_numpy(batch.actions).long())
-        with torch.no_grad():
-            target_q_next = self._target(next_states, goals)
-            targets = double_q_targets(
-                network(next_states, goals) if config.double_q else target_q_next,
-                target_q_next,
-                symmetry.action_masks(allowed),
-                reached,
-                fallen,
-                config.discount,
-            )
-            least = torch.from_numpy(batch.least_returns).float()
-            targets = torch.maximum(targets, least)
-        q = network(states, goals).gather(1, actions[:, None])[:, 0]
+        targets = self._targets(batch, symmetry, goals)
+        q = self.network(states, goals).gather(1, actions[:, None])[:, 0]
         loss = mse_loss if config.squared_errors else smooth_l1_loss
         losses = loss(q, targets, reduction="none")
+        # An episode ends at the goal: nobody asks for values there.
+        asked = torch.from_numpy(~goals_reached(batch.states, batch.goals))
         return (losses * asked).mean() + self._imitation_loss()
+
+    @torch.no_grad()
+    def _targets(
+        self, batch: Samples, symmetry: Symmetry | NoSymmetry, goals: torch.Tensor
+    ) -> torch.Tensor:
+        """What the values (N,) of a batch should be, seen through the symmetries."""
+        config = self._config
+        next_states = symmetry.states(torch.from_numpy(batch.next_states))
+        allowed = torch.from_numpy(allowed_actions(batch.next_states))
+        target_q_next = self._target(next_states, goals)
+        targets = double_q_targets(
+            self.network(next_states, goals) if config.double_q else target_q_next,
+            target_q_next,
+            symmetry.action_masks(allowed),
+            torch.from_numpy(goals_reached(batch.next_states, batch.goals)),
+            torch.from_numpy(objects_fallen(batch.next_states)),
+            config.discount,
+        )
+        least = torch.from_numpy(batch.least_returns).float()
+        return torch.maximum(targets, least)
 
     def _imitation_loss(self) -> torch.Tensor | float:
         if self._plans is None:
