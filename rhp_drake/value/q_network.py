@@ -25,6 +25,7 @@ HIDDEN_LAYERS: Final = (330, 180, 80, 64)  # Section VII-A.
 _WIDTH: Final = 192
 # Wavelengths, in the features' unit of 0.1 m: from one action's way to sixteen of them.
 _WAVELENGTHS: Final = (8.0, 4.0, 2.0, 1.0, 0.5)
+_PHASES: Final = (0.0, math.pi / 2)
 
 
 class QNetwork(nn.Module, ABC):
@@ -93,10 +94,17 @@ class SetQNetwork(QNetwork):
 
     architecture = "set"
     any_number = True
+    _wave_numbers: torch.Tensor
+    _phases: torch.Tensor
 
     def __init__(self, num_objects: int) -> None:
         super().__init__(num_objects)
-        of_object = OBJECT_FEATURES + 4 * 2 * len(_WAVELENGTHS)
+        of_object = OBJECT_FEATURES + 4 * len(_PHASES) * len(_WAVELENGTHS)
+        # A sine and a cosine of each length.
+        waves = [(2 * math.pi / x, phase) for x in _WAVELENGTHS for phase in _PHASES]
+        wave_numbers, phases = torch.tensor(waves).T[..., None]
+        self.register_buffer("_wave_numbers", wave_numbers, persistent=False)
+        self.register_buffer("_phases", phases, persistent=False)
         of_pair = 3  # The obstacle's position from the target, and its distance.
         target = HAND_FEATURES + of_object
         widths = (_WIDTH, _WIDTH)
@@ -113,14 +121,9 @@ class SetQNetwork(QNetwork):
         hand, of_objects = features(states, goals).tensor_split([HAND_FEATURES], dim=1)
         objects = of_objects.unflatten(1, (-1, OBJECT_FEATURES))
         points = object_points(objects)
-        waves = [
-            wave(2 * math.pi / length * points)
-            for length in _WAVELENGTHS
-            for wave in (torch.sin, torch.cos)
-        ]
-        target, obstacles = torch.cat([objects, *waves], dim=-1).tensor_split(
-            [1], dim=1
-        )
+        waves = torch.sin(self._wave_numbers * points[..., None, :] + self._phases)
+        objects = torch.cat([objects, waves.flatten(2)], dim=-1)
+        target, obstacles = objects.tensor_split([1], dim=1)
         hand_and_target = torch.cat([hand[:, None], target], dim=-1)
         ways = obstacles[..., :2] - target[..., :2]
         pairs = torch.cat(
