@@ -162,10 +162,12 @@ def tiny_variants(plans, monkeypatch):
                 learning=FittedQConfig(**learning),
                 rounds=Rounds(**rounds),
                 from_scratch=variant.from_scratch,
+                plans_only=variant.plans_only,
                 network=variant.network,
             ),
         )
     monkeypatch.setattr(bench, "SHIPPED_PLANS", plans)
+    monkeypatch.setattr(bench, "_NUM_DEMONSTRATIONS", 3)
     monkeypatch.setattr(bench, "_PERIOD", 4)
     monkeypatch.setattr(bench, "_NUM_TASKS", 2)
 

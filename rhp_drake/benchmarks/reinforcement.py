@@ -1,8 +1,9 @@
-"""Variants of reinforcement learning side by side, from the same start and plans.
+"""Variants of reinforcement learning side by side, from the same start and data.
 
-A folder holds `settings.json`, what all trainings have in common; `plans.parquet`, the
-plans that come with the package, with their states; and for each variant and seed the
-weights, whose provenance has the learning curve, once they are done.
+A folder holds `settings.json`, what all trainings have in common; `demonstrations`, of
+the first training tasks; `plans.parquet`, the plans that come with the package, with
+their states; and for each variant and seed the weights, whose provenance has the
+learning curve, once they are done.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,8 @@ from rhp_drake.evaluation.validation import greedy_successes
 from rhp_drake.files import exclusive, write_atomically
 from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
 from rhp_drake.learning.dataset import load_dataset
+from rhp_drake.learning.demonstration_folder import demonstrate_tasks
+from rhp_drake.learning.demonstrators import PlanningDemonstrator
 from rhp_drake.learning.fitted_q import FittedQ
 from rhp_drake.learning.reinforcement import Reinforcement
 from rhp_drake.learning.replay import SHIPPED_PLANS, rebuild
@@ -39,6 +42,8 @@ STARTS: Final = {
     "set": "package://rhp_drake/q_network/imitation_set.safetensors",
 }
 _SETTINGS: Final = "settings.json"
+_DEMONSTRATIONS: Final = "demonstrations"
+_NUM_DEMONSTRATIONS: Final = 1000
 _PLANS: Final = "plans.parquet"
 # Gradient steps between points of a learning curve.
 _PERIOD: Final = 2000
@@ -111,8 +116,16 @@ class Trainings:
                     f"{self.folder}: was made with other settings; choose another one."
                 )
             write_atomically(path, settings)
-            if not (self.folder / _PLANS).exists():
-                rebuild(SHIPPED_PLANS, self.folder / _PLANS)
+            if not self.data_path(plans_only=True).exists():
+                rebuild(SHIPPED_PLANS, self.data_path(plans_only=True))
+            for _ in demonstrate_tasks(
+                self.data_path(plans_only=False),
+                range(_NUM_DEMONSTRATIONS),
+                PlanningDemonstrator(0, NUM_OBJECTS),
+                num_workers,
+                self.commit,
+            ):
+                pass
             missing = []
             for training in trainings:
                 if self.weights_path(training).exists():
@@ -128,9 +141,9 @@ class Trainings:
         """Where the weights of a training are once it is done."""
         return self.folder / f"{training.variant}_{training.seed}.safetensors"
 
-    def plans_path(self) -> Path:
-        """Of the plans with their states."""
-        return self.folder / _PLANS
+    def data_path(self, plans_only: bool) -> Path:
+        """Of the demonstrations, or of plans alone."""
+        return self.folder / (_PLANS if plans_only else _DEMONSTRATIONS)
 
     def _settings(self) -> dict[str, Any]:
         starts = [repr(_start(network)) for network in STARTS]
@@ -160,7 +173,7 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
         network, sources = ARCHITECTURES[variant.network](NUM_OBJECTS), []
     else:
         network = _start(variant.network)
-        sources = [load_dataset([trainings.plans_path()])]
+        sources = [load_dataset([trainings.data_path(variant.plans_only)])]
     config = replace(variant.learning, num_steps=trainings.num_steps)
     learner = FittedQ(network, sources, config, stream(training.seed, "reinforcement"))
     path = trainings.weights_path(training)

@@ -16,12 +16,14 @@ class Variant:
         learning: How the network learns.
         rounds: How RHP acts.
         from_scratch: Whether it begins with a random network and no demonstrations.
+        plans_only: Whether demonstrations are plans, without what else was simulated.
         network: Its architecture, see `value.q_network`.
     """
 
     learning: FittedQConfig = field(default_factory=FittedQConfig)
     rounds: Rounds = field(default_factory=Rounds)
     from_scratch: bool = False
+    plans_only: bool = False
     network: str = "set"
 
 
@@ -44,6 +46,7 @@ PAPER: Final = Variant(
         batch_size=512,
     ),
     rounds=Rounds(num_tasks=60, acting=Acting(executed_only=True)),
+    plans_only=True,
     network="paper",
 )
 _LEARNING: Final = BEST.learning
@@ -51,6 +54,7 @@ VARIANTS: Final = {
     "best": BEST,
     "paper": PAPER,
     "paper_network": replace(BEST, network="paper"),
+    "plans_only": replace(BEST, plans_only=True),
     "no_hindsight": replace(BEST, learning=replace(_LEARNING, hindsight=0.0)),
     "no_double_q": replace(BEST, learning=replace(_LEARNING, double_q=False)),
     "no_symmetry": replace(BEST, learning=replace(_LEARNING, symmetry=False)),
