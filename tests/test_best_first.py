@@ -91,6 +91,25 @@ def test_a_goal_state_needs_no_actions(push_model, q_network):
     assert found.first_seconds == found.seconds
 
 
+def test_a_goal_state_is_found_beside_one_that_just_misses(push_model):
+    """Searches take states that differ by less than a centimetre for the same."""
+    instance = sample_instance(stream(5, TRAINING, 0))
+    state, goals = instance.initial_state, instance.goals.copy()
+    # The target is half a millimetre outside.
+    goals[0] = state[3] + 0.0605, state[4]
+
+    class Creep:
+        """Each action moves the target by a millimetre."""
+
+        def step(self, states, actions):
+            children = states.copy()
+            children[:, 3] += 0.001
+            return children
+
+    found = plan_best_first(Creep(), Favourite(4), state, goals, max_transitions=12)
+    assert len(found.actions) == 1
+
+
 def test_an_obstacle_that_is_far_out_is_brought_back(push_model, q_network):
     # The target is home, and an obstacle 12 cm away from where it belongs.
     state = np.array([0.3, 0, 0, 0.6, 0, 0, 0.42, 0, 0, 0.3, -0.2, 0])

@@ -3,10 +3,20 @@
 import pytest
 from rich.console import Console
 
-from rhp_drake.evaluation.comparison import Trial, make_failure_table, make_table
+from rhp_drake.evaluation.comparison import (
+    PLANAR,
+    Comparison,
+    Trial,
+    make_failure_table,
+    make_table,
+    run_comparison,
+)
 from rhp_drake.evaluation.episode import Episode
 from rhp_drake.physics import UNCERTAINTY_LEVELS
-from rhp_drake.planning.policy_config import POLICIES
+from rhp_drake.planning.policy_config import POLICIES, GreedyConfig
+from rhp_drake.random_streams import VALIDATION
+from rhp_drake.value.q_network import SetQNetwork
+from rhp_drake.value.weights import save_q_network
 
 FAILURES = (
     "out of actions",
@@ -52,6 +62,19 @@ def test_tables_fit(levels, simulated_seconds):
         assert all(("medium" in row) == (i % 4 == 2) for i, row in enumerate(rows)) == (
             len(levels) > 1
         )
+
+
+def test_numbers_of_objects_in_turn(tmp_path):
+    """Also in one process, which keeps what it made."""
+    weights = tmp_path / "weights.safetensors"
+    save_q_network(SetQNetwork(3), weights)
+    config = GreedyConfig(q_network=str(weights))
+    for num_objects in (1, 3, 5):
+        comparison = Comparison(
+            {"gp": config}, ["none"], VALIDATION, num_objects, 1, PLANAR, 0
+        )
+        ((_, episode),) = run_comparison(comparison, 1)
+        assert episode.outcome in ("succeeded", "out of actions", "object fell")
 
 
 def test_cells():

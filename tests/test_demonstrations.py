@@ -10,6 +10,7 @@ import sys
 import time
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -337,18 +338,30 @@ def test_compact_files_do_for_replay_only(folder, tmp_path):
         rebuild(small, tmp_path / "full.parquet")
 
 
-def test_verification_notices_a_wrong_plan(folder, tmp_path):
-    table = pq.read_table(folder)
+def test_plans_that_miss_their_goals_are_not_rebuilt(folder, tmp_path, caplog):
+    small, full = tmp_path / "compact.parquet", tmp_path / "full.parquet"
+    solved = compact([folder / "tasks_0000000.parquet"], small)
+    _turn_about(small, small)
+    assert rebuild(small, full) == solved - 1
+    assert "1 plans miss their goals and are left out" in caplog.text
+    data = load_dataset([full])
+    assert len(data.plan_actions) == len(data.plan_states)
+
+
+def _turn_about(source, out):
+    """Replaces the first plan by turns that move nothing."""
+    table = pq.read_table(source)
     actions = table["actions"].to_pylist()
     actions[0] = [4] * len(actions[0])
-    path = tmp_path / "tasks_0000000.parquet"
     index = table.column_names.index("actions")
     column = table.schema.field("actions")
-    import pyarrow as pa
+    plans = pa.array(actions, column.type)
+    pq.write_table(table.set_column(index, column, plans), out)
 
-    pq.write_table(
-        table.set_column(index, column, pa.array(actions, column.type)), path
-    )
+
+def test_verification_notices_a_wrong_plan(folder, tmp_path):
+    path = tmp_path / "tasks_0000000.parquet"
+    _turn_about(folder, path)
     (replay,) = verify([path], 1)
     assert replay.reached == replay.identical == replay.num_plans - 1
 

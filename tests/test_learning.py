@@ -19,7 +19,7 @@ from rhp_drake.learning.imitation import (
     return_of,
 )
 from rhp_drake.learning.reinforcement import Reinforcement, Rounds
-from rhp_drake.learning.sampling import sample
+from rhp_drake.learning.sampling import _go_back, sample
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
@@ -111,6 +111,18 @@ def test_hindsight_goals_are_reached_in_time(data):
     )
     difference = object_positions(after) - object_positions(samples.next_states[:200])
     assert np.median(np.abs(difference)) < 1e-5
+
+
+def test_hindsight_counts_actions(data):
+    """From each transition, so many actions lead to the end."""
+    ends = np.arange(len(data.search_actions))
+    rows, num_actions = _go_back(data, ends, stream(1))
+    assert num_actions.max() > 3
+    for row, count, end in zip(rows, num_actions, ends, strict=True):
+        way = [end]
+        while way[-1] != row:
+            way.append(data.search_origins[way[-1]])
+        assert len(way) == count
 
 
 def test_simulated_ways_to_the_goal_bound_the_values(data):

@@ -11,17 +11,18 @@ from rhp_drake import cli
 from rhp_drake.benchmarks import reinforcement as bench
 from rhp_drake.benchmarks.reinforcement import Training, Trainings
 from rhp_drake.commands import training as commands
+from rhp_drake.commands.bench_reinforcement import _VARIANTS
 from rhp_drake.errors import InputError
 from rhp_drake.evaluation import validation
 from rhp_drake.learning import training
 from rhp_drake.learning.demonstration_files import write_table
-from rhp_drake.learning.fitted_q import FittedQConfig
+from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
 from rhp_drake.learning.imitation import Imitation
 from rhp_drake.learning.learner import Learner
-from rhp_drake.learning.reinforcement import Rounds
+from rhp_drake.learning.reinforcement import Reinforcement, Rounds
 from rhp_drake.learning.replay import SHIPPED_PLANS, rebuild
 from rhp_drake.learning.variants import VARIANTS, Variant
-from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.q_network import ARCHITECTURES, SetQNetwork
 from rhp_drake.value.weights import load_q_network, save_q_network
 
 STEPS = 8
@@ -51,8 +52,6 @@ def small(monkeypatch):
     monkeypatch.setattr(training, "_CHECKPOINT_PERIOD", 2)
     monkeypatch.setattr(commands, "_LOG_PERIOD", 2)
     monkeypatch.setattr(commands, "_VALIDATION_PERIOD", 4)
-    yield
-    torch.set_flush_denormal(False)
 
 
 def imitate(monkeypatch, plans, out) -> int:
@@ -141,12 +140,61 @@ def test_a_full_disk_loses_nothing(limit, plans, monkeypatch, capsys, tmp_path):
 
 def test_reinforce_refuses_what_cannot_be(plans, monkeypatch, capsys, tmp_path):
     start = tmp_path / "start.safetensors"
-    save_q_network(PaperQNetwork(3), start)
+    save_q_network(SetQNetwork(3), start)
     options = ("--demonstrations", plans, "--start", start, "--out", tmp_path / "w")
+    assert rhp(monkeypatch, "reinforce", *options, "--variant", "paper") == 2
+    assert "the variant paper has the network 'paper'." in capsys.readouterr().err
     assert rhp(monkeypatch, "reinforce", *options, "--variant", "worst") == 2
     assert "'worst' is neither best nor paper." in capsys.readouterr().err
     assert rhp(monkeypatch, "reinforce", *options, "--steps", "1500") == 2
     assert "1500 steps are no whole number of rounds" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("variant", ["best", "paper"])
+def test_reinforce_ends_the_same_if_it_is_stopped(
+    variant, tiny_variants, plans, monkeypatch, capsys, tmp_path
+):
+    torch.manual_seed(0)
+    start = tmp_path / "start.safetensors"
+    save_q_network(ARCHITECTURES[VARIANTS[variant].network](3), start)
+
+    def reinforce(out) -> int:
+        options = ("--demonstrations", plans, "--start", start, "--variant", variant)
+        more = ("--steps", STEPS, "--workers", 1, "--out", out)
+        return rhp(monkeypatch, "reinforce", *options, *more)
+
+    straight, stopped = tmp_path / "straight", tmp_path / "stopped"
+    assert reinforce(straight) == 0
+    # While it learns, and while it acts.
+    step, act = FittedQ.step, Reinforcement._act
+
+    def stopping_step(self):
+        if self.num_steps == 3:
+            raise KeyboardInterrupt
+        step(self)
+
+    def stopping_act(self, index):
+        for done in act(self, index):
+            yield done
+            if (index, done) == (1, 1):
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(FittedQ, "step", stopping_step)
+    assert reinforce(stopped) == 130
+    monkeypatch.setattr(FittedQ, "step", step)
+    monkeypatch.setattr(Reinforcement, "_act", stopping_act)
+    assert reinforce(stopped) == 130
+    monkeypatch.setattr(Reinforcement, "_act", act)
+    assert reinforce(stopped) == 0
+    assert same_weights(straight, stopped)
+    provenance = load_q_network(stopped, 3).provenance
+    assert provenance["command"].startswith("rhp reinforce --demonstrations")
+    assert provenance["rounds"]["num_tasks"] == 2
+    assert not list(tmp_path.glob("*.rounds")) + list(tmp_path.glob("*.checkpoint"))
+
+
+def test_all_variants_are_trained_by_default():
+    assert _VARIANTS.split(",") == list(VARIANTS)
 
 
 @pytest.fixture
@@ -166,7 +214,6 @@ def tiny_variants(plans, monkeypatch):
                 network=variant.network,
             ),
         )
-    monkeypatch.setattr(bench, "SHIPPED_PLANS", plans)
     monkeypatch.setattr(bench, "_NUM_DEMONSTRATIONS", 3)
     monkeypatch.setattr(bench, "_PERIOD", 4)
     monkeypatch.setattr(bench, "_NUM_TASKS", 2)
@@ -186,16 +233,19 @@ def test_variants_side_by_side(tiny_variants, monkeypatch, tmp_path):
 
     # Again, stopped before the first is written.
     folder = Trainings(tmp_path / "stopped", STEPS, "commit")
-    evaluate = bench._rhp33_successes
-    monkeypatch.setattr(bench, "_rhp33_successes", _fail)
-    with pytest.raises(OSError, match="No space"):
-        list(folder.make(wanted, 1))
-    monkeypatch.setattr(bench, "_rhp33_successes", evaluate)
+    for name, fails_at in (("greedy_successes", 2), ("_rhp33_successes", 1)):
+        evaluate, calls = getattr(bench, name), iter(range(1, 99))
+
+        def fail(network, evaluate=evaluate, calls=calls, fails_at=fails_at):
+            if next(calls) == fails_at:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return evaluate(network)
+
+        monkeypatch.setattr(bench, name, fail)
+        with pytest.raises(OSError, match="No space"):
+            list(folder.make(wanted, 1))
+        monkeypatch.setattr(bench, name, evaluate)
     assert list(folder.make(wanted, 1)) == results
     assert list(folder.make(wanted, 1)) == results
     with pytest.raises(InputError, match="made with other settings"):
         list(Trainings(tmp_path / "straight", STEPS + 4, "commit").make(wanted, 1))
-
-
-def _fail(network):
-    raise OSError(errno.ENOSPC, "No space left on device")

@@ -1,9 +1,8 @@
 """Variants of reinforcement learning side by side, from the same start and data.
 
 A folder holds `settings.json`, what all trainings have in common; `demonstrations`, of
-the first training tasks; `plans.parquet`, the plans that come with the package, with
-their states; and for each variant and seed the weights, whose provenance has the
-learning curve, once they are done.
+the first training tasks; `plans.parquet`, the plans among them; and for each variant
+and seed the weights, whose provenance has the learning curve, once they are done.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,19 +12,17 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-import torch
-
 from rhp_drake.errors import InputError
 from rhp_drake.evaluation.episode import run_episode
 from rhp_drake.evaluation.validation import greedy_successes
 from rhp_drake.files import exclusive, write_atomically
 from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
 from rhp_drake.learning.dataset import load_dataset
-from rhp_drake.learning.demonstration_folder import demonstrate_tasks
+from rhp_drake.learning.demonstration_folder import demonstrate_tasks, shard_paths
 from rhp_drake.learning.demonstrators import PlanningDemonstrator
 from rhp_drake.learning.fitted_q import FittedQ
 from rhp_drake.learning.reinforcement import Reinforcement
-from rhp_drake.learning.replay import SHIPPED_PLANS, rebuild
+from rhp_drake.learning.replay import compact, rebuild
 from rhp_drake.learning.training import Stepped, make_repeatable, train
 from rhp_drake.learning.variants import VARIANTS
 from rhp_drake.planning.receding_horizon import RecedingHorizon
@@ -46,7 +43,7 @@ _DEMONSTRATIONS: Final = "demonstrations"
 _NUM_DEMONSTRATIONS: Final = 1000
 _PLANS: Final = "plans.parquet"
 # Gradient steps between points of a learning curve.
-_PERIOD: Final = 2000
+_PERIOD: Final = 1000
 _NUM_TASKS: Final = 200
 
 
@@ -116,16 +113,7 @@ class Trainings:
                     f"{self.folder}: was made with other settings; choose another one."
                 )
             write_atomically(path, settings)
-            if not self.data_path(plans_only=True).exists():
-                rebuild(SHIPPED_PLANS, self.data_path(plans_only=True))
-            for _ in demonstrate_tasks(
-                self.data_path(plans_only=False),
-                range(_NUM_DEMONSTRATIONS),
-                PlanningDemonstrator(0, NUM_OBJECTS),
-                num_workers,
-                self.commit,
-            ):
-                pass
+            self._make_demonstrations(num_workers)
             missing = []
             for training in trainings:
                 if self.weights_path(training).exists():
@@ -137,6 +125,25 @@ class Trainings:
             ):
                 yield result
 
+    def _make_demonstrations(self, num_workers: int) -> None:
+        folder, plans = (
+            self.data_path(plans_only=False),
+            self.data_path(plans_only=True),
+        )
+        for _ in demonstrate_tasks(
+            folder,
+            range(_NUM_DEMONSTRATIONS),
+            PlanningDemonstrator(0, NUM_OBJECTS),
+            num_workers,
+            self.commit,
+        ):
+            pass
+        if not plans.exists():
+            compact_plans = self.folder / "compact_plans.parquet"
+            compact(shard_paths([folder]), compact_plans)
+            rebuild(compact_plans, plans)
+            compact_plans.unlink()
+
     def weights_path(self, training: Training) -> Path:
         """Where the weights of a training are once it is done."""
         return self.folder / f"{training.variant}_{training.seed}.safetensors"
@@ -147,11 +154,18 @@ class Trainings:
 
     def _settings(self) -> dict[str, Any]:
         starts = [repr(_start(network)) for network in STARTS]
-        return {"num_steps": self.num_steps, "starts": starts}
+        return {
+            "num_steps": self.num_steps,
+            "starts": starts,
+            "num_demonstrations": _NUM_DEMONSTRATIONS,
+            "num_tasks": _NUM_TASKS,
+        }
 
     def _read(self, training: Training) -> TrainingResult:
         path = self.weights_path(training)
         noted = load_q_network(path, NUM_OBJECTS).provenance
+        if noted["variant"] != _describe(training):
+            raise InputError(f"{path}: was made by another variant of this name.")
         return TrainingResult(
             training,
             tuple((step, successes) for step, successes in noted["curve"]),
@@ -159,6 +173,11 @@ class Trainings:
             noted["num_tasks"],
             noted["num_transitions"],
         )
+
+
+def _describe(training: Training) -> dict[str, Any]:
+    """What is to be noted of a training's method."""
+    return {"name": training.variant, **asdict(VARIANTS[training.variant])}
 
 
 def _start(architecture: str) -> QNetwork:
@@ -188,15 +207,14 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
     checkpoint = path.with_suffix(".checkpoint")
     curve_path = path.with_suffix(".curve.json")
     curve = json.loads(curve_path.read_text()) if curve_path.exists() else {}
-    for event in train(learner, checkpoint, asdict(variant.rounds), reinforcement):
+    described = _describe(training)
+    for event in train(learner, checkpoint, described, reinforcement):
         if isinstance(event, Stepped) and (
             event.num_steps % _PERIOD == 0 or event.num_steps == config.num_steps
         ):
             # Steps that are taken again after a stop have the same successes.
             curve[str(event.num_steps)], _ = greedy_successes(network)
             write_atomically(curve_path, json.dumps(curve))
-    # Physics are computed as everywhere else.
-    torch.set_flush_denormal(False)
     result = TrainingResult(
         training,
         tuple((int(step), successes) for step, successes in curve.items()),
@@ -206,9 +224,8 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
     )
     network.provenance = {
         "commit": trainings.commit,
-        **asdict(training),
-        "rounds": asdict(variant.rounds),
-        **asdict(config),
+        "seed": training.seed,
+        "variant": described,
         "curve": result.curve,
         "rhp33": result.rhp33,
         "num_tasks": result.num_tasks,
@@ -217,6 +234,7 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
     save_q_network(network, path)
     checkpoint.unlink(missing_ok=True)
     curve_path.unlink(missing_ok=True)
+    reinforcement.forget()
     return result
 
 

@@ -34,10 +34,11 @@ def reinforcement(
     ] = 10_000,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
-    """Trains variants of the method from the same start, and compares them.
+    """Trains variants of the method, and compares them on validation tasks.
 
-    All see validation tasks only. You may stop this at any moment: the same command
-    goes on where it was.
+    They start from the shipped imitation weights, and all have the demonstrations of
+    1000 tasks; from_scratch has neither. You may stop this at any moment: the same
+    command goes on where it was.
     """
     from rich.console import Console
 
@@ -53,6 +54,11 @@ def reinforcement(
         if name not in VARIANTS:
             raise InputError(
                 f"--variants: {name!r} is not one of {', '.join(VARIANTS)}."
+            )
+        num_steps = VARIANTS[name].rounds.num_steps
+        if steps % num_steps:
+            raise InputError(
+                f"--steps: {steps} steps are no whole number of rounds of {num_steps}."
             )
     wanted = [Training(name, seed) for seed in range(seeds) for name in names]
     console = Console(highlight=False, soft_wrap=True)
@@ -117,7 +123,7 @@ def _table(by_variant: "dict[str, list[TrainingResult]]", steps: int) -> "Table"
         transitions = sum(r.num_transitions for r in results) / len(results)
         table.add_row(
             name,
-            *cells([r.curve[-1][1] if r.curve else 0 for r in results], num_tasks),
+            *cells([r.curve[-1][1] for r in results], num_tasks),
             *cells([r.rhp33 for r in results], num_tasks),
             f"{transitions:.0f}",
         )

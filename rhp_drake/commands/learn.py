@@ -102,6 +102,16 @@ def reinforce(
         raise InputError("none of the demonstrations holds a search to learn from.")
     network = load_q_network(start, data.goals.shape[1])
     chosen = VARIANTS[variant]
+    if network.architecture != chosen.network:
+        raise InputError(
+            f"{start}: the weights of the network {network.architecture!r}; the "
+            f"variant {variant} has the network {chosen.network!r}."
+        )
+    if chosen.plans_only and len(data.search_actions) != len(data.plan_actions):
+        raise InputError(
+            f"the variant {variant} learns from plans alone, as `rhp demos rebuild` "
+            "makes them; the demonstrations hold other transitions, too."
+        )
     config = replace(chosen.learning, num_steps=steps)
     learner = FittedQ(network, [data], config, stream(seed, "reinforcement"))
     reinforcement = Reinforcement(
@@ -114,6 +124,7 @@ def reinforce(
     )
     origin = _origin(seed, start, network) | {"rounds": asdict(chosen.rounds)}
     train_and_save(learner, out, demonstrations, origin, Console(), reinforcement)
+    reinforcement.forget()
 
 
 def _origin(seed: int, start: Path, network: "QNetwork") -> dict[str, Any]:

@@ -100,7 +100,8 @@ class Comparison:
 
 # Runs an instance, under a seed and with its index in the set, in some physics.
 _Runner: TypeAlias = Callable[[TaskInstance, int, int, ObjectPhysics], Episode]
-# What a process keeps from trial to trial, by world and policy: both are dear to make.
+# What a process keeps from trial to trial, by world, number of objects and policy: they
+# are dear to make.
 _runners: dict[str, _Runner] = {}
 
 
@@ -124,7 +125,7 @@ def _make_runner(config: PolicyConfig, world: str, num_objects: int) -> _Runner:
 def _run_trial(trial: Trial, comparison: Comparison) -> Episode:
     config, world = comparison.policies[trial.policy], comparison.world
     instance = load_instances(comparison.instances, comparison.num_objects)[trial.index]
-    key = f"{world} {config!r}"
+    key = f"{world} {instance.num_objects} {config!r}"
     if key not in _runners:
         _runners[key] = _make_runner(config, world, instance.num_objects)
     physics = draw_physics(

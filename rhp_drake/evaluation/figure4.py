@@ -17,8 +17,6 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-import torch
-
 from rhp_drake.errors import InputError
 from rhp_drake.evaluation.episode import greedy_episodes
 from rhp_drake.evaluation.figure4_data import Point, PointResult, batch_successes
@@ -192,6 +190,4 @@ def _train(point: Point, figure: Figure4) -> Imitation:
     origin = figure.settings() | asdict(point)
     for _ in train(learner, checkpoint, origin):
         pass
-    # Physics are computed as everywhere else.
-    torch.set_flush_denormal(False)
     return learner

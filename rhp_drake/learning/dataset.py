@@ -32,7 +32,6 @@ class Dataset:
         search_actions_left: From each transition's state to the task's goals on the
             shortest way that starts with it and that was simulated, at least 1; 0 if
             there is none.  Shape (T,).
-        num_transitions: Of each task's search, shape (P,).
         solved: Whether each task has a plan, shape (P,).
     """
 
@@ -47,7 +46,6 @@ class Dataset:
     search_next_states: np.ndarray
     search_origins: np.ndarray
     search_actions_left: np.ndarray
-    num_transitions: np.ndarray
     solved: np.ndarray
 
 
@@ -76,12 +74,14 @@ def load_dataset(paths: Sequence[Path]) -> Dataset:
         InputError: If a file cannot be read, or there is none.
     """
     return concatenate(
-        [_flatten(read_table(path, _COLUMNS)) for path in shard_paths(paths)]
+        [_flatten(path, read_table(path, _COLUMNS)) for path in shard_paths(paths)]
     )
 
 
-def _flatten(table: pa.Table) -> Dataset:
+def _flatten(path: Path, table: pa.Table) -> Dataset:
     goals = numbers(table["goals"])
+    if (lengths(table["states"]) != lengths(table["actions"]) + 1).any():
+        raise InputError(f"{path}: a plan's states are not one more than its actions.")
     plan_lengths = lengths(table["actions"])
     num_transitions = lengths(table["search_actions"])
     # Of each task's states the last is where its plan ends.
@@ -114,7 +114,6 @@ def _flatten(table: pa.Table) -> Dataset:
         search_next_states=next_states,
         search_origins=origins,
         search_actions_left=_actions_left(reached, origins),
-        num_transitions=num_transitions,
         solved=table["solved"].to_numpy(),
     )
 

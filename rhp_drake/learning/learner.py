@@ -107,6 +107,7 @@ class Learner(ABC):
                 "generator": json.dumps(self._generator.bit_generator.state),
                 "num_steps": self.num_steps,
                 "mean_loss": self.mean_loss,
+                "architecture": self.network.architecture,
                 "config": vars(self.config),
                 "origin": json.dumps(origin),
             },
@@ -122,8 +123,12 @@ class Learner(ABC):
         """
         try:
             saved = torch.load(path, weights_only=True)
-            same = saved["config"] == vars(self.config)
-            if not same or saved["origin"] != json.dumps(origin):
+            same = (
+                saved["architecture"] == self.network.architecture
+                and saved["config"] == vars(self.config)
+                and saved["origin"] == json.dumps(origin)
+            )
+            if not same:
                 raise InputError(
                     f"{path}: a checkpoint of other work; delete it to start anew."
                 )
@@ -133,5 +138,12 @@ class Learner(ABC):
             self._schedule.load_state_dict(saved["schedule"])
             self._generator.bit_generator.state = json.loads(saved["generator"])
             self.num_steps, self.mean_loss = saved["num_steps"], saved["mean_loss"]
-        except (OSError, RuntimeError, KeyError, pickle.UnpicklingError) as error:
+        except (
+            OSError,
+            EOFError,
+            RuntimeError,
+            KeyError,
+            ValueError,
+            pickle.UnpicklingError,
+        ) as error:
             raise InputError(f"{path}: not a readable checkpoint ({error}).") from error

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
+import shutil
 from typing import Final
 
 from rhp_drake.errors import InputError
@@ -101,10 +102,18 @@ class Reinforcement:
             The number of tasks done in this round, if there is anything to do.
         """
         index, steps = divmod(self._learner.num_steps, self.rounds.num_steps)
+        if self._learner.num_steps == 0:
+            # There is no checkpoint: later rounds are of work that began otherwise.
+            for path in set(self._folder.glob("round_*")) - {self._round(0)}:
+                shutil.rmtree(path)
         if steps == 0:
             yield from self._act(index)
         if self._read(index + 1):
             self._learner.sources = self._replay_buffer()
+
+    def forget(self) -> None:
+        """Removes the experience, once nothing is to be learned from it any more."""
+        shutil.rmtree(self._folder)
 
     def _read(self, num_rounds: int) -> bool:
         """Reads the experience of the first so many rounds; whether any was new."""

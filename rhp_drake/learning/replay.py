@@ -8,6 +8,7 @@ bytes a plan.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+import logging
 from pathlib import Path
 from typing import Final
 
@@ -30,6 +31,8 @@ from rhp_drake.planning.search import chain
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.task import goals_reached
 from rhp_drake.workers import run_over
+
+_logger = logging.getLogger("rhp_drake")
 
 # Those that come with the package, in compact form.
 SHIPPED_PLANS: Final = Path(__file__).resolve().parent.parent / "data/plans.parquet"
@@ -92,7 +95,8 @@ def compact(paths: Sequence[Path], out: Path) -> int:
 def rebuild(path: Path, out: Path) -> int:
     """Writes demonstrations with states from the compact form.
 
-    Their searches hold the transitions of the plans alone.
+    Their searches hold the transitions of the plans alone.  Plans that do not reach
+    their goals again are left out.
 
     Returns:
         The number of plans.
@@ -101,9 +105,14 @@ def rebuild(path: Path, out: Path) -> int:
         InputError: If the file cannot be read, or holds no plans.
     """
     table = read_table(path, COMPACT_COLUMNS)
-    rebuilt = _rebuild(table)
+    rebuilt = [
+        d for d in _rebuild(table) if goals_reached(d.states[-1], d.instance.goals)
+    ]
     if not rebuilt:
-        raise InputError(f"{path}: holds no plans.")
+        raise InputError(f"{path}: holds no plans that reach their goals.")
+    if lost := table.num_rows - len(rebuilt):
+        # Another machine or version of Drake may end a push a hair's breadth elsewhere.
+        _logger.warning("%s: %d plans miss their goals and are left out", path, lost)
     details = {k: v for k, v in about(table).items() if k in ("demonstrator", "commit")}
     write_table(out, to_table(rebuilt, details))
     return len(rebuilt)

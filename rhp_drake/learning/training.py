@@ -1,6 +1,7 @@
 """The training loop: acting where there is reinforcement, learning, checkpoints."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -40,8 +41,6 @@ def make_repeatable(seed: int) -> None:
     """Sets torch so that training is the same bits on any number of cores."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    # Gradients of dead units get so small that arithmetic takes five times as long.
-    torch.set_flush_denormal(True)
 
 
 def train(
@@ -53,8 +52,8 @@ def train(
     """Trains to the end, from the checkpoint if there is one.
 
     Whoever stops at any moment, and calls this again with a new learner, gets the same
-    network.  The checkpoint stays; it is for the caller to remove once the weights are
-    safe.
+    network, and is told of the same steps, some of them twice.  The checkpoint stays;
+    it is for the caller to remove once the weights are safe.
 
     Args:
         learner: Trains its network.
@@ -82,8 +81,24 @@ def _train(
         if reinforcement is not None:
             for done in reinforcement.act():
                 yield Acted(done)
-        learner.step()
+        with _denormals_flushed():
+            learner.step()
+        # First what is told of a step, so that no checkpoint is ahead of it.
+        yield Stepped(learner.num_steps)
         last = learner.num_steps == learner.config.num_steps
         if learner.num_steps % _CHECKPOINT_PERIOD == 0 or last:
             learner.save(checkpoint, origin)
-        yield Stepped(learner.num_steps)
+
+
+@contextmanager
+def _denormals_flushed() -> Iterator[None]:
+    """Gradients of dead units get so small that arithmetic takes five times as long.
+
+    Physics, which may be computed in other processes, too, is to have the same bits in
+    all: so this is for learning alone.
+    """
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)

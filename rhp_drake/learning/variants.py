@@ -54,6 +54,7 @@ VARIANTS: Final = {
     "best": BEST,
     "paper": PAPER,
     "paper_network": replace(BEST, network="paper"),
+    "from_scratch": replace(BEST, from_scratch=True),
     "plans_only": replace(BEST, plans_only=True),
     "no_hindsight": replace(BEST, learning=replace(_LEARNING, hindsight=0.0)),
     "no_double_q": replace(BEST, learning=replace(_LEARNING, double_q=False)),
@@ -63,5 +64,4 @@ VARIANTS: Final = {
     "uncertain_physics": replace(BEST, rounds=_acting(uncertainty="high")),
     "searches": replace(BEST, rounds=_acting(num_searches=3)),
     "search_returns": replace(BEST, learning=replace(_LEARNING, search_returns=True)),
-    "from_scratch": replace(BEST, from_scratch=True),
 }

@@ -69,12 +69,14 @@ def plan_best_first(
         indices = record.add(sources, actions, children, nodes.transitions[parents])
         new = []
         for i in np.flatnonzero(~hopeless(children, goals, state)):
-            if nodes.has_near(children[i]):
+            # A goal state may be nearly the same as one that just misses the goal.
+            reached = goals_reached(children[i], goals)
+            if nodes.has_near(children[i]) and not reached:
                 continue
             node = nodes.add(
                 children[i], int(parents[i]), int(actions[i]), int(indices[i])
             )
-            if goals_reached(children[i], goals):
+            if reached:
                 goal = node
                 break
             if nodes.depths[node] < MAX_ACTIONS:

@@ -21,7 +21,7 @@ from rhp_drake.value.features import (
 
 HIDDEN_LAYERS: Final = (330, 180, 80, 64)  # Section VII-A.
 
-# Of the set network.
+# Of the set network; files name the architecture alone, so others need another name.
 _WIDTH: Final = 192
 # Wavelengths, in the features' unit of 0.1 m: from one action's way to sixteen of them.
 _WAVELENGTHS: Final = (8.0, 4.0, 2.0, 1.0, 0.5)
