@@ -6,7 +6,11 @@ import pytest
 from rhp_drake import cli, typed_yaml
 from rhp_drake.errors import InputError
 from rhp_drake.frozen_instances import SETS, load_instances
-from rhp_drake.planning.policy_config import GreedyConfig, RecedingHorizonConfig
+from rhp_drake.planning.policy_config import (
+    GreedyConfig,
+    MakePolicy,
+    RecedingHorizonConfig,
+)
 from rhp_drake.resources import scenarios_path
 from rhp_drake.scenario import (
     Layout,
@@ -57,6 +61,8 @@ def test_bundled(path):
     assert not overlapping_bodies(instance.initial_state)
     assert not goals_reached(instance.initial_state, instance.goals)
     assert load_scenario(path.stem)[0] == name
+    # Its weights are for so many objects.
+    MakePolicy(scenario.policy, instance.num_objects)
 
 
 def test_layout(tmp_path):

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rhp_drake.benchmarks.reinforcement import TrainingResult
 
 _VARIANTS = (
-    "best,paper,paper_network,from_scratch,plans_only,executed_only,no_hindsight,"
-    "no_double_q,no_symmetry,epsilon_greedy,uncertain_physics,searches,search_returns"
+    "best,paper,paper_network,from_scratch,plans_only,no_hindsight,no_double_q,"
+    "no_symmetry,executed_only,epsilon_greedy,uncertain_physics,searches,search_returns"
 )
 
 
