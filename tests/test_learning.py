@@ -28,7 +28,7 @@ from rhp_drake.task import (
     hand_targets,
     object_positions,
 )
-from rhp_drake.value.q_network import PaperQNetwork
+from rhp_drake.value.q_network import ARCHITECTURES, PaperQNetwork
 
 DEMONSTRATOR = PlanningDemonstrator(seed=11, num_objects=3)
 
@@ -155,7 +155,7 @@ def test_symmetries_are_those_of_the_task(data):
     states = data.search_states[rows].astype(float)
     actions = data.search_actions[rows].astype(int)
     goals = data.goals[data.search_tasks[rows]]
-    symmetry = Symmetry(len(rows), 3, stream(2))
+    symmetry = Symmetry(len(rows), 3, stream(2), torch.device("cpu"))
     seen = symmetry.states(torch.from_numpy(states)).numpy()
     seen_actions = symmetry.actions(torch.from_numpy(actions)).numpy()
     seen_goals = symmetry.goals(torch.from_numpy(goals)).numpy()
@@ -177,6 +177,19 @@ LEARNERS = [
     (FittedQ, FittedQConfig(num_steps=8, batch_size=64, imitation_weight=0.1)),
     (Imitation, ImitationConfig(num_steps=8, batch_size=64)),
 ]
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES.values())
+@pytest.mark.parametrize(
+    ("kind", "config"), LEARNERS, ids=["fitted_q", "both", "imitation"]
+)
+def test_all_is_computed_where_the_network_is(kind, config, architecture, data):
+    """On a GPU, for example; the meta device has shapes only, and refuses others."""
+    network = architecture(3).to("meta")
+    source = [data] if kind is FittedQ else data
+    loss = kind(network, source, config, stream(3))._loss()
+    assert loss.device.type == "meta"
+    loss.backward()
 
 
 @pytest.mark.parametrize(

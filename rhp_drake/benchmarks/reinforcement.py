@@ -6,6 +6,7 @@ and seed the weights, whose provenance has the learning curve, once they are don
 """
 
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 import json
@@ -186,13 +187,14 @@ def _start(architecture: str) -> QNetwork:
 
 def _train(training: Training, trainings: Trainings) -> TrainingResult:
     """Trains, evaluates, and writes the weights."""
-    make_repeatable(training.seed)
+    device = make_repeatable(training.seed)
     variant = VARIANTS[training.variant]
     if variant.from_scratch:
         network, sources = ARCHITECTURES[variant.network](NUM_OBJECTS), []
     else:
         network = _start(variant.network)
         sources = [load_dataset([trainings.data_path(variant.plans_only)])]
+    network.to(device)
     config = replace(variant.learning, num_steps=trainings.num_steps)
     learner = FittedQ(network, sources, config, stream(training.seed, "reinforcement"))
     path = trainings.weights_path(training)
@@ -240,7 +242,7 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
 
 def _rhp33_successes(network: QNetwork) -> int:
     world = PushModel(NUM_OBJECTS)
-    policy = RecedingHorizon(world, network, 3, 3, 0.5)
+    policy = RecedingHorizon(world, deepcopy(network).cpu(), 3, 3, 0.5)
     return sum(
         run_episode(world, policy, instance, 0, index).succeeded
         for index, instance in enumerate(load_instances(VALIDATION)[:_NUM_TASKS])

@@ -52,11 +52,11 @@ def imitate(
         known = ", ".join(ARCHITECTURES)
         raise InputError(f"--network: {network!r} is not one of {known}.")
     check_writable(out)
-    make_repeatable(seed)
+    device = make_repeatable(seed)
     data = load_dataset(demonstrations)
     if not data.solved.any():
         raise InputError("none of the demonstrations holds a plan to imitate.")
-    untrained = ARCHITECTURES[network](data.goals.shape[1])
+    untrained = ARCHITECTURES[network](data.goals.shape[1]).to(device)
     config = ImitationConfig(num_steps=steps)
     learner = Imitation(untrained, data, config, stream(seed, "imitation"))
     train_and_save(learner, out, demonstrations, {"seed": seed}, Console())
@@ -96,11 +96,11 @@ def reinforce(
     if variant not in ("best", "paper"):
         raise InputError(f"--variant: {variant!r} is neither best nor paper.")
     check_writable(out)
-    make_repeatable(seed)
+    device = make_repeatable(seed)
     data = load_dataset(demonstrations)
     if not len(data.search_actions):
         raise InputError("none of the demonstrations holds a search to learn from.")
-    network = load_q_network(start, data.goals.shape[1])
+    network = load_q_network(start, data.goals.shape[1]).to(device)
     chosen = VARIANTS[variant]
     if network.architecture != chosen.network:
         raise InputError(

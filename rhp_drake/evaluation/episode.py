@@ -1,6 +1,7 @@
 """One closed-loop run of a policy in the planar world."""
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 import time
 from typing import Protocol
@@ -116,7 +117,8 @@ def greedy_episodes(
 ) -> list[Episode]:
     """Runs the greedy policy of a Q-network on each instance, in the push model."""
     world = PushModel(network.num_objects)
-    policy = RecedingHorizon(world, network, 0, 0, 1.0)
+    # A state at a time is nothing for a GPU.
+    policy = RecedingHorizon(world, deepcopy(network).cpu(), 0, 0, 1.0)
     return [
         run_episode(world, policy, instance, 0, index)
         for index, instance in enumerate(instances)

@@ -181,11 +181,11 @@ def _checkpoint_path(point: Point, figure: Figure4) -> Path:
 
 def _train(point: Point, figure: Figure4) -> Imitation:
     """Trains to the end, from a checkpoint if there is one."""
-    make_repeatable(point.seed)
+    device = make_repeatable(point.seed)
     data = first_plans(load_dataset(figure.plan_paths()), point.num_plans)
-    learner = Imitation(
-        PaperQNetwork(NUM_OBJECTS), data, figure.config, stream(point.seed, "imitation")
-    )
+    network = PaperQNetwork(NUM_OBJECTS).to(device)
+    generator = stream(point.seed, "imitation")
+    learner = Imitation(network, data, figure.config, generator)
     checkpoint = _checkpoint_path(point, figure)
     origin = figure.settings() | asdict(point)
     for _ in train(learner, checkpoint, origin):

@@ -31,16 +31,24 @@ class Symmetry:
         num_samples: N.
         num_objects: m.
         generator: Draws the symmetries.
+        device: Of the samples.
     """
 
     def __init__(
-        self, num_samples: int, num_objects: int, generator: np.random.Generator
+        self,
+        num_samples: int,
+        num_objects: int,
+        generator: np.random.Generator,
+        device: torch.device,
     ) -> None:
-        self._mirrored = torch.from_numpy(generator.random(num_samples) < 0.5)
+        mirrored = generator.random(num_samples) < 0.5
+        self._mirrored = torch.from_numpy(mirrored).to(device)
+        self._mirrored_actions = _MIRRORED_ACTIONS.to(device)
         self._sign = torch.where(self._mirrored, -1.0, 1.0)
         obstacles = 1 + generator.random((num_samples, num_objects - 1)).argsort(axis=1)
         target = np.zeros((num_samples, 1), int)
-        self._order = torch.from_numpy(np.concatenate([target, obstacles], axis=1))
+        order = np.concatenate([target, obstacles], axis=1)
+        self._order = torch.from_numpy(order).to(device)
 
     def states(self, states: torch.Tensor) -> torch.Tensor:
         """States (N, 3 + 3 m) seen through the symmetries."""
@@ -57,11 +65,12 @@ class Symmetry:
 
     def actions(self, actions: torch.Tensor) -> torch.Tensor:
         """Actions (N,) seen through the symmetries."""
-        return torch.where(self._mirrored, _MIRRORED_ACTIONS[actions], actions)
+        return torch.where(self._mirrored, self._mirrored_actions[actions], actions)
 
     def action_masks(self, masks: torch.Tensor) -> torch.Tensor:
         """Masks of the actions (N, 6) seen through the symmetries."""
-        return torch.where(self._mirrored[:, None], masks[:, _MIRRORED_ACTIONS], masks)
+        mirrored = masks[:, self._mirrored_actions]
+        return torch.where(self._mirrored[:, None], mirrored, masks)
 
 
 class NoSymmetry:

@@ -117,7 +117,10 @@ class FittedQ(Learner):
         self._plans = None
         if config.imitation_weight:
             self._plans = Plans(
-                self.sources[0], ImitationConfig.margin, config.discount
+                self.sources[0],
+                ImitationConfig.margin,
+                config.discount,
+                network.device,
             )
         self._target = deepcopy(network)
 
@@ -142,20 +145,23 @@ class FittedQ(Learner):
             hindsight=config.hindsight,
             search_returns=config.search_returns,
         )
+        network = self.network
         symmetry = (
-            Symmetry(config.batch_size, self.network.num_objects, self._generator)
+            Symmetry(
+                config.batch_size, network.num_objects, self._generator, network.device
+            )
             if config.symmetry
             else NoSymmetry()
         )
-        goals = symmetry.goals(torch.from_numpy(batch.goals).float())
-        states = symmetry.states(torch.from_numpy(batch.states))
-        actions = symmetry.actions(torch.from_numpy(batch.actions).long())
+        goals = symmetry.goals(self._tensor(batch.goals).float())
+        states = symmetry.states(self._tensor(batch.states))
+        actions = symmetry.actions(self._tensor(batch.actions).long())
         targets = self._targets(batch, symmetry, goals)
-        q = self.network(states, goals).gather(1, actions[:, None])[:, 0]
+        q = network(states, goals).gather(1, actions[:, None])[:, 0]
         loss = mse_loss if config.squared_errors else smooth_l1_loss
         losses = loss(q, targets, reduction="none")
         # An episode ends at the goal: nobody asks for values there.
-        asked = torch.from_numpy(~goals_reached(batch.states, batch.goals))
+        asked = self._tensor(~goals_reached(batch.states, batch.goals))
         return (losses * asked).mean() + self._imitation_loss()
 
     @torch.no_grad()
@@ -164,19 +170,23 @@ class FittedQ(Learner):
     ) -> torch.Tensor:
         """What the values (N,) of a batch should be, seen through the symmetries."""
         config = self._config
-        next_states = symmetry.states(torch.from_numpy(batch.next_states))
-        allowed = torch.from_numpy(allowed_actions(batch.next_states))
+        next_states = symmetry.states(self._tensor(batch.next_states))
+        allowed = self._tensor(allowed_actions(batch.next_states))
         target_q_next = self._target(next_states, goals)
         targets = double_q_targets(
             self.network(next_states, goals) if config.double_q else target_q_next,
             target_q_next,
             symmetry.action_masks(allowed),
-            torch.from_numpy(goals_reached(batch.next_states, batch.goals)),
-            torch.from_numpy(objects_fallen(batch.next_states)),
+            self._tensor(goals_reached(batch.next_states, batch.goals)),
+            self._tensor(objects_fallen(batch.next_states)),
             config.discount,
         )
-        least = torch.from_numpy(batch.least_returns).float()
+        least = self._tensor(batch.least_returns).float()
         return torch.maximum(targets, least)
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        """The array where the network is."""
+        return torch.from_numpy(array).to(self.network.device)
 
     def _imitation_loss(self) -> torch.Tensor | float:
         if self._plans is None:

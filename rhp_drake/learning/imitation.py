@@ -69,14 +69,21 @@ class Plans:
         demonstrations: With at least one plan.
         margin: k.
         discount: gamma.
+        device: Of the network.
     """
 
-    def __init__(self, demonstrations: Dataset, margin: int, discount: float) -> None:
+    def __init__(
+        self,
+        demonstrations: Dataset,
+        margin: int,
+        discount: float,
+        device: torch.device,
+    ) -> None:
         d = demonstrations
-        self._states = torch.from_numpy(d.plan_states).float()
-        self._goals = torch.from_numpy(d.goals[d.plan_tasks]).float()
-        self._actions = torch.from_numpy(d.plan_actions).long()
-        self._actions_left = torch.from_numpy(d.plan_actions_left).float()
+        self._states = torch.from_numpy(d.plan_states).float().to(device)
+        self._goals = torch.from_numpy(d.goals[d.plan_tasks]).float().to(device)
+        self._actions = torch.from_numpy(d.plan_actions).long().to(device)
+        self._actions_left = torch.from_numpy(d.plan_actions_left).float().to(device)
         self._margin = margin
         self._discount = discount
 
@@ -85,8 +92,8 @@ class Plans:
     ) -> torch.Tensor:
         """The loss of Eq. 2 and 3 on a batch, seen through random symmetries."""
         rows = generator.integers(len(self._states), size=batch_size)
-        batch = torch.from_numpy(rows)
-        symmetry = Symmetry(batch_size, network.num_objects, generator)
+        batch = torch.from_numpy(rows).to(network.device)
+        symmetry = Symmetry(batch_size, network.num_objects, generator, network.device)
         q = network(
             symmetry.states(self._states[batch]), symmetry.goals(self._goals[batch])
         )
@@ -119,7 +126,9 @@ class Imitation(Learner):
         generator: np.random.Generator,
     ) -> None:
         super().__init__(network, config, generator)
-        self._plans = Plans(demonstrations, config.margin, config.discount)
+        self._plans = Plans(
+            demonstrations, config.margin, config.discount, network.device
+        )
 
     def _loss(self) -> torch.Tensor:
         size = self.config.batch_size

@@ -122,7 +122,9 @@ class Learner(ABC):
             InputError: If it cannot be read, or belongs to other work.
         """
         try:
-            saved = torch.load(path, weights_only=True)
+            saved = torch.load(
+                path, weights_only=True, map_location=self.network.device
+            )
             same = (
                 saved["architecture"] == self.network.architecture
                 and saved["config"] == vars(self.config)

@@ -135,8 +135,8 @@ class Reinforcement:
         first = _FIRST_TASK + index * self.rounds.num_tasks
         demonstrator = RecedingHorizonDemonstrator(
             self._seed,
-            # The network goes on learning.
-            deepcopy(self._learner.network),
+            # The network goes on learning; physics need the processor, not the GPU.
+            deepcopy(self._learner.network).cpu(),
             self.rounds.acting,
         )
         yield from demonstrate_tasks(

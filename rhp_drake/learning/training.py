@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+import os
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,10 +38,21 @@ class Stepped:
     num_steps: int
 
 
-def make_repeatable(seed: int) -> None:
-    """Sets torch so that training is the same bits on any number of cores."""
+def make_repeatable(seed: int) -> torch.device:
+    """Sets torch so that training is the same bits on any number of cores.
+
+    Returns:
+        Where to train: the GPU if there is one.  It repeats itself, too, but not the
+        processor's bits.
+    """
     torch.manual_seed(seed)
     torch.set_num_threads(1)
+    if not torch.cuda.is_available():
+        return torch.device("cpu")
+    # What cuBLAS wants to be told to be deterministic.
+    os.environ["CUBLAS_WORKSPACE_CONFIG"] = ":4096:8"
+    torch.use_deterministic_algorithms(True)
+    return torch.device("cuda")
 
 
 def train(

@@ -54,6 +54,11 @@ class QNetwork(nn.Module, ABC):
         name = type(self).__name__
         return f"{name}({self.num_objects}, sha256={digest.hexdigest()[:16]})"
 
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return next(self.parameters()).device
+
     @abstractmethod
     def forward(self, states: torch.Tensor, goals: torch.Tensor) -> torch.Tensor:
         """Values (N, 6) for states (N, 3 + 3 m) and goals (N, m, 2)."""
@@ -61,9 +66,10 @@ class QNetwork(nn.Module, ABC):
     @torch.inference_mode()
     def values(self, states: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Values (N, 6) for states (N, 3 + 3 m) and one task's goals (m, 2)."""
-        batch = torch.as_tensor(states, dtype=torch.float32)
-        of_task = torch.as_tensor(goals, dtype=torch.float32)
-        return self(batch, of_task.expand(len(batch), -1, -1)).double().numpy()
+        batch = torch.as_tensor(states, dtype=torch.float32, device=self.device)
+        of_task = torch.as_tensor(goals, dtype=torch.float32, device=self.device)
+        values = self(batch, of_task.expand(len(batch), -1, -1))
+        return values.double().cpu().numpy()
 
 
 class PaperQNetwork(QNetwork):
