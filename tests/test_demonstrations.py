@@ -130,9 +130,12 @@ def test_the_folder_is_the_same_whoever_fills_it(folder, tmp_path):
 
 KILLED = """
 from pathlib import Path
+import signal
 from rhp_drake.learning.demonstration_folder import demonstrate_tasks
 from test_demonstrations import Counts
 if __name__ == "__main__":
+    # A shell's background jobs, and all they start, ignore it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     counts = Counts(blocks_at=270)
     list(demonstrate_tasks(Path("FOLDER"), range(250, 450), counts, WORKERS))
 """
