@@ -165,7 +165,7 @@ class Trainings:
     def _read(self, training: Training) -> TrainingResult:
         path = self.weights_path(training)
         noted = load_q_network(path, NUM_OBJECTS).provenance
-        if noted["variant"] != _describe(training):
+        if noted.get("variant") != _describe(training):
             raise InputError(f"{path}: was made by another variant of this name.")
         return TrainingResult(
             training,
