@@ -1,5 +1,8 @@
 """Variants of reinforcement learning side by side, from the same start and data.
 
+All have half the batch, and RHP acts on half as many tasks a round, as where weights
+are made to be used: many trainings fit into the time of one.
+
 A folder holds `settings.json`, what all trainings have in common; `demonstrations`, of
 the first training tasks; `plans.parquet`, the plans among them; and for each variant
 and seed the weights, whose provenance has the learning curve, once they are done.
@@ -44,7 +47,7 @@ _DEMONSTRATIONS: Final = "demonstrations"
 _NUM_DEMONSTRATIONS: Final = 1000
 _PLANS: Final = "plans.parquet"
 # Gradient steps between points of a learning curve.
-_PERIOD: Final = 1000
+_PERIOD: Final = 2000
 _NUM_TASKS: Final = 200
 
 
@@ -195,12 +198,17 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
         network = _start(variant.network)
         sources = [load_dataset([trainings.data_path(variant.plans_only)])]
     network.to(device)
-    config = replace(variant.learning, num_steps=trainings.num_steps)
+    config = replace(
+        variant.learning,
+        num_steps=trainings.num_steps,
+        batch_size=variant.learning.batch_size // 2,
+    )
+    rounds = replace(variant.rounds, num_tasks=variant.rounds.num_tasks // 2)
     learner = FittedQ(network, sources, config, stream(training.seed, "reinforcement"))
     path = trainings.weights_path(training)
     reinforcement = Reinforcement(
         learner,
-        variant.rounds,
+        rounds,
         path.with_suffix(".rounds"),
         training.seed,
         1,

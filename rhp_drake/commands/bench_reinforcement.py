@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rhp_drake.benchmarks.reinforcement import TrainingResult
 
 _VARIANTS = (
-    "best,paper,paper_network,from_scratch,plans_only,no_hindsight,no_double_q,"
-    "no_symmetry,executed_only,epsilon_greedy,uncertain_physics,searches,search_returns"
+    "best,from_scratch,executed_only,no_hindsight,paper_network,no_symmetry,"
+    "plans_only,no_double_q,epsilon_greedy,uncertain_physics,search_returns,paper"
 )
 
 
@@ -31,7 +31,7 @@ def reinforcement(
     seeds: Annotated[int, typer.Option(min=1, help="Trainings of each.")] = 3,
     steps: Annotated[
         int, typer.Option(min=1000, help="Gradient steps of a training.")
-    ] = 10_000,
+    ] = 8000,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
     """Trains variants of the method, and compares them on validation tasks.

@@ -1,6 +1,5 @@
 """Who makes demonstrations: the RRT, a search guided by a Q-network, and RHP."""
 
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 import time
@@ -28,8 +27,6 @@ from rhp_drake.value.q_network import QNetwork
 
 # A task not solved with this many simulated actions yields its trees but no plan.
 _MAX_TRANSITIONS: Final = 6000
-# Limit of one search from a state that RHP came through; most need 90.
-_MAX_SEARCHED: Final = 300
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,6 @@ class Acting:
         num_roll_outs: n.
         horizon: h; 0 makes it epsilon-greedy.
         uncertainty: Of the physics in which it acts, which RHP does not know.
-        num_searches: From how many states of an episode it searches, best first.
         executed_only: Whether nothing but what was executed is kept.
     """
 
@@ -114,7 +110,6 @@ class Acting:
     num_roll_outs: int = 6
     horizon: int = 6
     uncertainty: str = "none"
-    num_searches: int = 0
     executed_only: bool = False
 
 
@@ -123,9 +118,7 @@ class RecedingHorizonDemonstrator:
     """Acts by epsilon-RHP (section V of the paper).
 
     It keeps what was executed, as the paper's replay buffer does, or all roll-outs,
-    which are more and as true.  Afterwards it may search, from some of the states that
-    it came through, for better ways to the goal: so the network learns what it should
-    have done where RHP was lost.
+    which are more and as true.
 
     Attributes:
         seed: Of the tasks and the policy.
@@ -166,7 +159,6 @@ class RecedingHorizonDemonstrator:
             stream(self.seed, TRAINING, task, "world_physics"),
         )
         states, actions = self._act(instance, physics, task)
-        self._search(states[:-1], instance.goals, task)
         seconds = time.perf_counter() - begin
         search = (
             chain(np.array(states), np.array(actions, int))
@@ -205,20 +197,6 @@ class RecedingHorizonDemonstrator:
             if goals_reached(state, goals) or objects_fallen(state):
                 break
         return states, actions
-
-    def _search(self, states: list[np.ndarray], goals: np.ndarray, task: int) -> None:
-        """Searches from some of the states; the recorder notes what is simulated."""
-        generator = stream(self.seed, TRAINING, task, "searched_states")
-        count = min(self.acting.num_searches, len(states))
-        for index in generator.choice(len(states), count, replace=False):
-            with suppress(PushModelError):
-                plan_best_first(
-                    self._recorder,
-                    self.q_network,
-                    states[index],
-                    goals,
-                    max_transitions=_MAX_SEARCHED,
-                )
 
 
 def _demonstration(
