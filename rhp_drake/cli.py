@@ -10,6 +10,7 @@ from rhp_drake.commands.evaluate import evaluate
 from rhp_drake.commands.figure4 import figure4
 from rhp_drake.commands.learn import imitate, reinforce
 from rhp_drake.commands.plan import plan
+from rhp_drake.commands.report import report
 from rhp_drake.commands.run import run
 from rhp_drake.errors import InputError, WorkError
 
@@ -19,7 +20,7 @@ app = typer.Typer(
     # A traceback is for developers; it need not fill the screen with variables.
     pretty_exceptions_show_locals=False,
 )
-for command in (run, plan, imitate, reinforce, evaluate, figure4):
+for command in (run, plan, imitate, reinforce, evaluate, report, figure4):
     app.command()(command)
 app.add_typer(demos, name="demos")
 app.add_typer(bench, name="bench")

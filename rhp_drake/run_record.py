@@ -12,9 +12,9 @@ import subprocess
 from typing import Any, Final
 
 from rhp_drake import typed_yaml
-from rhp_drake.closed_loop import Outcome
 from rhp_drake.files import write_atomically
 from rhp_drake.resources import resolve
+from rhp_drake.run_closed_loop import Outcome
 from rhp_drake.scenario import Scenario
 from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 from rhp_drake.task import Action

@@ -20,7 +20,7 @@ from rhp_drake.physics import UNCERTAINTY_LEVELS
 from rhp_drake.planning.policy_config import PolicyConfig, RecedingHorizonConfig
 from rhp_drake.random_streams import TRAINING, VALIDATION, stream
 from rhp_drake.resources import scenarios_path
-from rhp_drake.station.simulated_station import StationConfig
+from rhp_drake.station.station_models import StationConfig
 from rhp_drake.systems.command_guard import CommandGuardConfig
 from rhp_drake.visualization import VisualizationConfig
 
@@ -115,24 +115,8 @@ def load_scenario(
     Raises:
         InputError: If anything is wrong with it; the message names file and key.
     """
-    path = _find(Path(path))
-    document = typed_yaml.read_file(path)
-    if name is None:
-        # A file without names would look like one with many scenarios.
-        _check_named(path, document)
-        if len(document) > 1:
-            raise InputError(
-                f"{path}: has several scenarios, choose one by name: "
-                f"{', '.join(document)}."
-            )
-        (name,) = document
-    elif name not in document:
-        raise InputError(
-            f"{path}: has no scenario {name!r}, only {', '.join(document)}."
-        )
-    _check_named(path, {name: document[name]})
-    where = f"{path}: {name}"
-    scenario = typed_yaml.merge(document[name], Scenario(), where)
+    where, name, node = read_named(Path(path), name, "scenario")
+    scenario = typed_yaml.merge(node, Scenario(), where)
     for text in overrides:
         where_text = f"{where}, overridden by {text!r}"
         node = typed_yaml.read_document(text, where_text)
@@ -144,12 +128,45 @@ def load_scenario(
     return name, scenario
 
 
-def _check_named(path: Path, document: dict[str, Any]) -> None:
-    """Raises InputError unless the document maps names to scenarios."""
+def read_named(
+    path: Path, name: str | None, kind: str
+) -> tuple[str, str, dict[str, Any]]:
+    """Reads one of the named documents of a file.
+
+    Args:
+        path: The file, or the bare name of one that comes with the package.
+        name: Of the document; may be None if the file has one.
+        kind: What the documents are, for errors.
+
+    Returns:
+        What to call it in errors, its name, and the document.
+
+    Raises:
+        InputError: If there is no such document.
+    """
+    path = _find(path)
+    document = typed_yaml.read_file(path)
+    if name is None:
+        # A file without names would look like one with many documents.
+        _check_named(path, document, kind)
+        if len(document) > 1:
+            raise InputError(
+                f"{path}: has several {kind}s, choose one by name: "
+                f"{', '.join(document)}."
+            )
+        (name,) = document
+    elif name not in document:
+        raise InputError(f"{path}: has no {kind} {name!r}, only {', '.join(document)}.")
+    _check_named(path, {name: document[name]}, kind)
+    return f"{path}: {name}", name, document[name]
+
+
+def _check_named(path: Path, document: dict[str, Any], kind: str) -> None:
+    """Raises InputError unless the document maps names to documents."""
     for key, node in document.items():
         if not isinstance(node, dict):
             raise InputError(
-                f"{path}: {key}: expected a scenario with its name before it, "
+                f"{path}: {key}: expected a {kind} with its name before it, "
                 f"'some_name: {{{key}: ...}}', not {node!r}."
             )
 
@@ -179,6 +196,7 @@ def check_scenario(scenario: Scenario) -> None:
         good = point.shape == (3,) and np.isfinite(point).all()
         _check(good, f"visualization.{key}", point.tolist(), "three finite numbers")
     scenario.policy.validate()
+    scenario.guard.validate()
     make_task_instance(scenario)
 
 

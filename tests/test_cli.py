@@ -1,4 +1,3 @@
-import json
 import subprocess
 import sys
 
@@ -7,12 +6,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from rhp_drake import cli
+from rhp_drake.errors import InputError
+from rhp_drake.evaluation import results
 from rhp_drake.value.q_network import PaperQNetwork
 from rhp_drake.value.weights import save_q_network
 
 COMMANDS = (
-    *("run", "plan", "demos", "imitate", "reinforce", "evaluate", "figure4"),
-    "bench",
+    *("run", "plan", "demos", "imitate", "reinforce", "evaluate", "report"),
+    *("figure4", "bench"),
 )
 
 
@@ -53,18 +54,20 @@ def test_each_command_has_help(command, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--policies", "kdp,best"], "--policies: 'best' is not one of kdp, gp, rhp3"),
-        (["--instances", "training"], "'training' is not a set of instances: "),
-        (["--count", "0"], "0 instances were asked for; the validation set has 500."),
-        (["--count", "501"], "501 instances were asked for; the validation set has"),
+        (["--policies", "kdp,best"], "'best' is no policy; there are kdp, gp, rhp33"),
+        (["--set", "training"], "'training' is not a set of instances: "),
+        (["--instances", "0"], "0 instances were asked for; the validation set has 5"),
+        (["--instances", "501"], "501 instances were asked for; the validation set "),
         (["--objects", "5", "--world", "station"], "the station has 3 objects, not 5."),
-        (["--world", "moon"], "'moon' is not a world: planar, station."),
+        (["--world", "moon"], "'moon' is not a world: planar, station, or package"),
+        (["--world", "moon:make"], "the world moon:make: cannot be imported: "),
         (
             ["--temperature", "0"],
             "policy.temperature is 0.0; it must be above 0 and finite.",
         ),
         (["--weights", "missing", "--policies", "gp"], "missing: there is no such fi"),
-        (["--out", "/dev/null/out.json"], "/dev/null: no folder can be made: "),
+        (["--out", "/dev/null/out"], "/dev/null/out: no folder can be made: "),
+        (["--table1"], "--table1: takes hours; --out says where to keep the results."),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -83,25 +86,55 @@ def test_impossible_options(option, monkeypatch, capsys):
     assert option.split("=")[0] in capsys.readouterr().err
 
 
-def test_evaluate_writes_every_episode(monkeypatch, capsys, tmp_path):
-    weights, out = tmp_path / "weights.safetensors", tmp_path / "out.json"
+def test_evaluate_writes_every_episode_and_report_a_page(monkeypatch, capsys, tmp_path):
+    weights, out = tmp_path / "weights.safetensors", tmp_path / "out"
     save_q_network(PaperQNetwork(3), weights)
     options = [
         "--policies=gp,rhp33",
         "--levels=none,none",
-        "--count=2",
+        "--instances=2",
         "--workers=1",
         f"--out={out}",
     ]
-    assert rhp(monkeypatch, "evaluate", *options, f"--weights={weights}") == 0
-    # A title may be broken into lines.
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "first 2 instances of the validation set, uncertainty: none" in printed
-    episodes = json.loads(out.read_text())
-    trials = [(episode["policy"], episode["index"]) for episode in episodes]
-    assert trials == [("gp", 0), ("gp", 1), ("rhp33", 0), ("rhp33", 1)]
-    for episode in episodes:
-        assert len(episode["decision_seconds"]) == episode["num_actions"]
+    for new in (4, 0):
+        assert rhp(monkeypatch, "evaluate", *options, f"--weights={weights}") == 0
+        # A line may be broken.
+        printed = " ".join(capsys.readouterr().out.split())
+        assert "planar world, validation set, uncertainty: none" in printed
+        assert f"{new} episodes in" in printed
+    table = pq.read_table(out / "episodes")
+    assert table["policy"].to_pylist() == ["gp", "gp", "rhp33", "rhp33"]
+    assert rhp(monkeypatch, "report", str(out), "--recordings=0") == 0
+    assert "report.html" in capsys.readouterr().out
+
+
+def test_the_command_of_table1_is_all_of_it_unless_told_otherwise(
+    monkeypatch, capsys, tmp_path
+):
+    seen = []
+
+    def run_experiment(folder, experiment, workers, commit, machine):
+        seen.append(experiment)
+        raise InputError("enough.")
+
+    monkeypatch.setattr(results, "run_experiment", run_experiment)
+    options = ("--instances=100", "--trials=1", "--policies=rhp66", "--levels=high")
+    for part in ((), options):
+        command = ("evaluate", "--table1", f"--out={tmp_path / 'out'}", *part)
+        assert rhp(monkeypatch, *command) == 2
+        assert capsys.readouterr().err.endswith("rhp: enough.\n")
+    whole, small = (experiment.batches() for experiment in seen)
+    # KDP, and three policies with three networks each; four levels; batches of 20.
+    assert len(whole) == 10 * 4 * 25 * 10
+    assert len(small) == 3 * 1 * 5 * 1
+    assert seen[0].instances == seen[1].instances == "evaluation"
+
+
+def test_report_reports_bad_input(monkeypatch, capsys, tmp_path):
+    assert rhp(monkeypatch, "report", str(tmp_path / "nothing")) == 2
+    message = capsys.readouterr().err
+    assert "nothing: is no folder of results: there is no settings.json." in message
+    assert not list(tmp_path.iterdir())
 
 
 def test_demos_makes_checks_compacts_and_rebuilds(monkeypatch, capsys, tmp_path):

@@ -8,27 +8,42 @@ from pydrake.systems.analysis import Simulator
 import pytest
 
 from rhp_drake.errors import InputError
+from rhp_drake.safety import Fault, describe
 from rhp_drake.station.ports import COMMAND_PERIOD
-from rhp_drake.systems.command_guard import CommandGuard, CommandGuardConfig, Fault
+from rhp_drake.station.ur5_kinematics import PUSHING_HEIGHT, inverse_kinematics
+from rhp_drake.systems.command_guard import CommandGuard, CommandGuardConfig
+from rhp_drake.task import WORKSPACE_UPPER
 
-START = np.array([0.1, -1.2, 1.5, -1.9, -1.57, 0.3])
+START = inverse_kinematics(np.array([0.5, 0.0, 0.2]))
 SMALL = 0.9 * CommandGuardConfig().velocity_limit * COMMAND_PERIOD
+
+
+NUM_OBJECTS = 2
 
 
 class Bench:
     """A guard in a simulator, one tick at a time."""
 
     def __init__(self, measured=START):
-        self.guard = CommandGuard(CommandGuardConfig())
+        self.guard = CommandGuard(CommandGuardConfig(), NUM_OBJECTS)
         self.simulator = Simulator(self.guard)
         self.context = self.simulator.get_mutable_context()
         self.ticks = 0
         self.give(START, measured)
+        self.know()
         self.simulator.Initialize()
 
     def give(self, desired, measured):
         self.guard.GetInputPort("position").FixValue(self.context, desired)
         self.guard.GetInputPort("position_measured").FixValue(self.context, measured)
+
+    def know(self, *, arm_age=0.0, arm_fault=Fault.NONE, object_ages=(0.0, 0.0)):
+        for name, value in (
+            ("arm_age", [arm_age]),
+            ("arm_fault", [float(arm_fault)]),
+            ("object_ages", object_ages),
+        ):
+            self.guard.GetInputPort(name).FixValue(self.context, value)
 
     def tick(self, desired, measured=None):
         """The command and the fault after a tick; a perfect arm if none is given."""
@@ -53,7 +68,7 @@ def test_starts_at_measured_position():
 
 
 def test_is_nan_before_initialization():
-    guard = CommandGuard(CommandGuardConfig())
+    guard = CommandGuard(CommandGuardConfig(), NUM_OBJECTS)
     context = guard.CreateDefaultContext()
     assert np.isnan(guard.GetOutputPort("position").Eval(context)).all()
 
@@ -62,7 +77,8 @@ def test_passes_safe_commands_on():
     dut = Bench()
     desired = START
     for _ in range(20):
-        desired = desired + SMALL
+        # Pan and wrist 3 leave the hand at its height.
+        desired = np.add(desired, [SMALL, 0, 0, 0, 0, SMALL])
         position, fault = dut.tick(desired)
         np.testing.assert_array_equal(position, desired)
         assert fault == Fault.NONE
@@ -158,8 +174,61 @@ def test_config_loads_from_yaml():
         CommandGuardConfig(velocity_limit=0.0),
         CommandGuardConfig(tracking_limit=math.nan),
         CommandGuardConfig(position_limits=[1.0]),
+        CommandGuardConfig(object_age_limit=-1.0),
+        CommandGuardConfig(height_tolerance=math.nan),
     ],
 )
 def test_bad_config(config):
-    with pytest.raises(InputError, match="limits"):
-        CommandGuard(config)
+    with pytest.raises(InputError, match="positive"):
+        CommandGuard(config, NUM_OBJECTS)
+
+
+@pytest.mark.parametrize(
+    ("known", "expected"),
+    [
+        ({"arm_age": 0.11}, Fault.STALE_MEASUREMENT),
+        ({"arm_age": math.nan}, Fault.STALE_MEASUREMENT),
+        ({"object_ages": (0.0, 0.51)}, Fault.STALE_POSE),
+        ({"object_ages": (math.inf, 0.0)}, Fault.STALE_POSE),
+        ({"object_ages": (0.0, math.nan)}, Fault.STALE_POSE),
+        ({"arm_fault": Fault.PROTECTIVE_STOP}, Fault.PROTECTIVE_STOP),
+        ({"arm_fault": Fault.CONNECTION_LOST}, Fault.CONNECTION_LOST),
+    ],
+)
+def test_old_measurements_and_faults_of_the_robot_stop_the_arm(known, expected):
+    dut = Bench()
+    dut.know(arm_age=0.09, object_ages=(0.49, 0.0))
+    assert dut.tick(START)[1] == Fault.NONE
+    dut.know(**known)
+    moved = np.add(START, [SMALL, 0, 0, 0, 0, 0])
+    position, fault = dut.tick(moved)
+    assert fault == expected
+    np.testing.assert_array_equal(position, START)
+    # It stays so when all is well again.
+    dut.know()
+    assert dut.tick(START)[1] == expected
+
+
+@pytest.mark.parametrize(
+    ("pose", "height", "fault"),
+    [
+        ((0.5, 0.0, 0.2), PUSHING_HEIGHT + 0.003, Fault.NONE),
+        ((0.5, 0.0, 0.2), PUSHING_HEIGHT + 0.005, Fault.HAND_OUTSIDE),
+        ((0.5, 0.0, 0.2), PUSHING_HEIGHT - 0.005, Fault.HAND_OUTSIDE),
+        ((0.5, WORKSPACE_UPPER[1] + 0.015, 0.2), PUSHING_HEIGHT, Fault.NONE),
+        ((0.5, WORKSPACE_UPPER[1] + 0.025, 0.2), PUSHING_HEIGHT, Fault.HAND_OUTSIDE),
+        ((0.175, 0.0, 0.2), PUSHING_HEIGHT, Fault.HAND_OUTSIDE),
+    ],
+)
+def test_the_hand_stays_over_its_workspace_at_its_height(pose, height, fault):
+    start = inverse_kinematics(np.array(pose), height)
+    assert Bench(measured=start).tick(start)[1] == fault
+
+
+def test_the_hand_stays_upright():
+    leaning = np.add(START, [0, 0, 0, 0, 0.04, 0])
+    assert Bench(measured=leaning).tick(leaning)[1] == Fault.HAND_OUTSIDE
+
+
+def test_all_faults_have_a_sentence():
+    assert all(describe(fault).endswith(".") for fault in Fault)

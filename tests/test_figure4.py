@@ -141,7 +141,9 @@ def all_succeed(monkeypatch):
     monkeypatch.setattr(
         figure4,
         "greedy_episodes",
-        lambda network, instances: [Episode("succeeded", 1) for _ in instances],
+        lambda network, instances: [
+            Episode("succeeded", [0], np.empty((2, 12))) for _ in instances
+        ],
     )
 
 

@@ -8,6 +8,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, DiscreteTimeDelay
 import pytest
 
+from rhp_drake.safety import Fault
 from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.ur5_kinematics import (
     PUSHING_HEIGHT,
@@ -16,7 +17,7 @@ from rhp_drake.station.ur5_kinematics import (
     inverse_kinematics,
 )
 from rhp_drake.systems import hand_servo
-from rhp_drake.systems.command_guard import CommandGuard, CommandGuardConfig, Fault
+from rhp_drake.systems.command_guard import CommandGuard, CommandGuardConfig
 from rhp_drake.systems.hand_servo import (
     ANGULAR_SPEED,
     JOINT_SPEED,
@@ -223,7 +224,10 @@ class ServoAndGuard:
         builder = DiagramBuilder()
         self.target = builder.AddSystem(ConstantVectorSource(np.zeros(3)))
         servo = builder.AddSystem(HandServo())
-        self.guard = builder.AddSystem(CommandGuard(CommandGuardConfig()))
+        self.guard = builder.AddSystem(CommandGuard(CommandGuardConfig(), 1))
+        for name in ("arm_age", "arm_fault", "object_ages"):
+            zero = builder.AddSystem(ConstantVectorSource(np.zeros(1)))
+            builder.Connect(zero.get_output_port(), self.guard.GetInputPort(name))
         self.robot = builder.AddSystem(DiscreteTimeDelay(COMMAND_PERIOD, 1, 6))
         builder.Connect(
             self.target.get_output_port(), servo.GetInputPort("hand_target")

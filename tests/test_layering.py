@@ -12,6 +12,7 @@ ROOT = Path(rhp_drake.__file__).parent
 # count, too.
 LAYERS = (
     {
+        "drivers",
         "errors",
         "files",
         "frozen_instances",
@@ -19,6 +20,7 @@ LAYERS = (
         "planar_geometry",
         "random_streams",
         "resources",
+        "safety",
         "task",
         "typed_yaml",
         "visualization",
@@ -29,6 +31,9 @@ LAYERS = (
     {"learning", "systems"},
     {"gymnasium_env", "scenario"},
     {"closed_loop"},
+    {"hardware"},
+    {"run_closed_loop"},
+    {"lab"},
     {"evaluation", "run_record"},
     {"benchmarks"},
     {"commands"},

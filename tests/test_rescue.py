@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhp_drake.evaluation.episode import run_episode
+from rhp_drake.evaluation.episode import run_episodes
 from rhp_drake.planning.policy import Decision
 from rhp_drake.planning.policy_config import POLICIES, MakePolicy
 from rhp_drake.planning.rescue import Rescued
@@ -47,7 +47,8 @@ def push_model():
 def test_a_plan_takes_over_in_a_state_seen_before(push_model):
     undecided = Undecided()
     policy = Rescued(undecided, push_model, Distance())
-    episode = run_episode(push_model, policy, TaskInstance(START, GOALS), 0, 0)
+    instance = TaskInstance(START, GOALS)
+    (episode,) = run_episodes(push_model.step, policy, [instance])
     assert episode.succeeded
     # Back, forth, and the third decision is made where the first one was.
     assert undecided.memories == [None, 1]

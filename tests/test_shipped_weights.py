@@ -4,8 +4,8 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 import pytest
 
-from rhp_drake.closed_loop import MakeClosedLoop, run_closed_loop
-from rhp_drake.evaluation.episode import run_episode
+from rhp_drake.closed_loop import MakeClosedLoop
+from rhp_drake.evaluation.episode import run_episodes
 from rhp_drake.frozen_instances import load_instances
 from rhp_drake.physics import draw_physics
 from rhp_drake.planning.policy_config import (
@@ -16,17 +16,16 @@ from rhp_drake.planning.policy_config import (
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION, stream
 from rhp_drake.resources import models_path
+from rhp_drake.run_closed_loop import run_closed_loop
 from rhp_drake.scenario import Scenario
 from rhp_drake.value.weights import load_q_network
 
 
 def successes(config, count, num_objects=3):
-    world, policy = PushModel(num_objects), MakePolicy(config, num_objects)
+    policy = MakePolicy(config, num_objects)
     instances = load_instances(VALIDATION, num_objects)[:count]
-    return sum(
-        run_episode(world, policy, instance, 0, index).succeeded
-        for index, instance in enumerate(instances)
-    )
+    episodes = run_episodes(PushModel(num_objects).step, policy, instances)
+    return sum(episode.succeeded for episode in episodes)
 
 
 def test_rhp_solves_nearly_all_and_more_than_imitation_does_greedily():

@@ -19,8 +19,8 @@ from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.simulated_station import (
     MakeSimulatedStation,
     SetStationState,
-    StationConfig,
 )
+from rhp_drake.station.station_models import StationConfig
 from rhp_drake.station.ur5_kinematics import inverse_kinematics
 from rhp_drake.task import BOX_SIDE
 

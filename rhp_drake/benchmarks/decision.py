@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rhp_drake.evaluation.episode import run_episode
+from rhp_drake.evaluation.episode import run_episodes
 from rhp_drake.physics import ObjectPhysics
 from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.planning.policy_config import RecedingHorizonConfig
@@ -183,10 +183,9 @@ def measure_decisions(
     num_objects = network.num_objects
     recorder = _Recorder(make_rhp66(network, PushModel(num_objects)), count)
     world = PushModel(num_objects)
-    for index, instance in enumerate(instances):
+    for _ in run_episodes(world.step, recorder, instances):
         if len(recorder.states) == count:
             break
-        run_episode(world, recorder, instance, 0, index)
     states = recorder.states
 
     benches = [_Bench(network, n) for n in threads]

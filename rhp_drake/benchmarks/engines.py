@@ -5,31 +5,31 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Final
 
-from rhp_drake.evaluation.episode import PlanarWorld
+from rhp_drake.planning.receding_horizon import TransitionFunction
 
 PUSH_MODEL: Final = "push model"
 
 
-def _make_push_model(num_objects: int, refinement: float) -> PlanarWorld:
+def _make_push_model(num_objects: int, refinement: float) -> TransitionFunction:
     from rhp_drake.push_model.transition import PushModel
 
     return PushModel(num_objects, refinement=refinement)
 
 
-def _make_box2d(num_objects: int, refinement: float) -> PlanarWorld:
+def _make_box2d(num_objects: int, refinement: float) -> TransitionFunction:
     from rhp_drake.benchmarks.box2d_model import Box2DModel
 
     return Box2DModel(num_objects, refinement)
 
 
-def _make_mujoco(num_objects: int, refinement: float) -> PlanarWorld:
+def _make_mujoco(num_objects: int, refinement: float) -> TransitionFunction:
     from rhp_drake.benchmarks.mujoco_model import MuJoCoModel
 
     return MuJoCoModel(num_objects, refinement)
 
 
 # By their names in the tables: the package, and the engine for m and a refinement.
-_ENGINES: Final[dict[str, tuple[str, Callable[[int, float], PlanarWorld]]]] = {
+_ENGINES: Final[dict[str, tuple[str, Callable[[int, float], TransitionFunction]]]] = {
     PUSH_MODEL: ("pydrake", _make_push_model),
     "Box2D": ("Box2D", _make_box2d),
     "MuJoCo": ("mujoco", _make_mujoco),
@@ -47,7 +47,9 @@ def describe_engines() -> str:
     return ", ".join(f"{p} {version(p) if find_spec(p) else 'none'}" for p in packages)
 
 
-def make_engine(name: str, num_objects: int, refinement: float = 1) -> PlanarWorld:
+def make_engine(
+    name: str, num_objects: int, refinement: float = 1
+) -> TransitionFunction:
     """Makes an engine for m = `num_objects`.
 
     Args:

@@ -8,9 +8,10 @@ from pathlib import Path
 from rhp_drake.benchmarks.decision import make_rhp66
 from rhp_drake.benchmarks.engines import PUSH_MODEL, make_engine
 from rhp_drake.benchmarks.push_model import FINE
-from rhp_drake.evaluation.episode import Episode, PlanarWorld, run_episode
+from rhp_drake.evaluation.episode import Episode, run_episode
+from rhp_drake.evaluation.world import PlanarWorld
 from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
-from rhp_drake.planning.receding_horizon import RecedingHorizon
+from rhp_drake.planning.receding_horizon import RecedingHorizon, TransitionFunction
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION
 from rhp_drake.value.weights import load_q_network
@@ -49,13 +50,14 @@ def _policy(weights: Path) -> RecedingHorizon:
 
 
 @lru_cache(maxsize=8)
-def _engine(world: World) -> PlanarWorld:
+def _engine(world: World) -> TransitionFunction:
     return make_engine(world.engine, NUM_OBJECTS, world.refinement)
 
 
 def _run_trial(trial: WorldTrial, weights: Path) -> Episode:
     instance = load_instances(VALIDATION)[trial.index]
-    return run_episode(_engine(trial.world), _policy(weights), instance, 0, trial.index)
+    world = PlanarWorld(_engine(trial.world).step, instance)
+    return run_episode(world, _policy(weights), instance, 0, trial.index)
 
 
 def run_in_worlds(

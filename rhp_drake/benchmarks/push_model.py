@@ -17,8 +17,8 @@ from rhp_drake.benchmarks.pairs import (
     errors_of_moved,
     sample_contact_pairs,
 )
-from rhp_drake.evaluation.episode import PlanarWorld
 from rhp_drake.evaluation.statistics import bootstrap_interval
+from rhp_drake.planning.receding_horizon import TransitionFunction
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 
@@ -199,7 +199,7 @@ def measure_batches(pairs: Pairs, num_objects: int) -> list[Speed]:
     ]
 
 
-def _stepping(engine: PlanarWorld, pairs: Pairs) -> Callable[[], None]:
+def _stepping(engine: TransitionFunction, pairs: Pairs) -> Callable[[], None]:
     def step() -> None:
         engine.step(*pairs)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rhp_drake.errors import InputError
-from rhp_drake.evaluation.episode import run_episode
+from rhp_drake.evaluation.episode import run_episodes
 from rhp_drake.evaluation.validation import greedy_successes
 from rhp_drake.files import exclusive, write_atomically
 from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
@@ -249,9 +249,8 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
 
 
 def _rhp33_successes(network: QNetwork) -> int:
-    world = PushModel(NUM_OBJECTS)
-    policy = RecedingHorizon(world, deepcopy(network).cpu(), 3, 3, 0.5)
-    return sum(
-        run_episode(world, policy, instance, 0, index).succeeded
-        for index, instance in enumerate(load_instances(VALIDATION)[:_NUM_TASKS])
-    )
+    push_model = PushModel(NUM_OBJECTS)
+    policy = RecedingHorizon(push_model, deepcopy(network).cpu(), 3, 3, 0.5)
+    instances = load_instances(VALIDATION)[:_NUM_TASKS]
+    episodes = run_episodes(push_model.step, policy, instances)
+    return sum(episode.succeeded for episode in episodes)

@@ -14,7 +14,7 @@ from rhp_drake.planning.policy_config import POLICIES
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
-    from rhp_drake.closed_loop import Outcome
+    from rhp_drake.run_closed_loop import Outcome
     from rhp_drake.scenario import Scenario
 
 

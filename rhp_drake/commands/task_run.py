@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from pydrake.systems.analysis import Simulator
     from rich.console import Console
 
-    from rhp_drake.closed_loop import Outcome
     from rhp_drake.planning.policy import Policy
+    from rhp_drake.run_closed_loop import Outcome
     from rhp_drake.scenario import Scenario
     from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 
@@ -135,9 +135,9 @@ def run_task(
         console: Where to say it.
         on_decision: Called soon after each decision, before it is said.
     """
-    from rhp_drake.closed_loop import Outcome, run_closed_loop
     from rhp_drake.physics import draw_physics
     from rhp_drake.random_streams import stream
+    from rhp_drake.run_closed_loop import Outcome, run_closed_loop
     from rhp_drake.scenario import make_task_instance
 
     instance = make_task_instance(scenario)

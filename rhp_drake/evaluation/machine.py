@@ -4,8 +4,12 @@ from importlib.metadata import version
 import platform
 
 
-def describe_machine(num_workers: int = 1) -> str:
-    """One line: processor, cores, workers and the versions that matter to speed."""
+def describe_machine(num_workers: int | None = 1) -> str:
+    """One line: processor, cores, workers and the versions that matter to speed.
+
+    Args:
+        num_workers: Processes; None for those of a cluster.
+    """
     model = platform.processor() or platform.machine()
     cores = 0
     try:
@@ -16,7 +20,7 @@ def describe_machine(num_workers: int = 1) -> str:
     except (OSError, IndexError):
         pass  # Not Linux: say what Python knows.
     return (
-        f"{model}, {cores or '?'} cores, {num_workers} worker(s), "
+        f"{model}, {cores or '?'} cores, {num_workers or 'a cluster of'} worker(s), "
         f"Python {platform.python_version()}, drake {version('drake')}, "
         f"torch {version('torch')}"
     )

@@ -8,11 +8,12 @@ from typing import Any, Final
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from rhp_drake.closed_loop import SUCCEEDED, MakeClosedLoop, run_closed_loop
+from rhp_drake.closed_loop import MakeClosedLoop
 from rhp_drake.physics import nominal_physics
 from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION, stream
+from rhp_drake.run_closed_loop import SUCCEEDED, run_closed_loop
 from rhp_drake.scenario import Scenario
 from rhp_drake.systems.receding_horizon_planner import Status
 from rhp_drake.task import (

@@ -8,12 +8,12 @@ from typing import Any, Final
 import matplotlib
 from matplotlib.figure import Figure
 
-from rhp_drake.evaluation.comparison import PAPER_SUCCESS
 from rhp_drake.evaluation.figure4_data import NUM_BATCHES, CurvePoint
+from rhp_drake.evaluation.paper_results import IMITATION, TABLE1
 from rhp_drake.files import write_atomically
 from rhp_drake.frozen_instances import SET_SIZE
 
-_STYLE: Final[dict[Any, Any]] = {
+STYLE: Final[dict[Any, Any]] = {
     "font.size": 11,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -29,32 +29,34 @@ _STYLE: Final[dict[Any, Any]] = {
     "svg.hashsalt": "rhp_drake",
 }
 _OURS: Final = "#0a6e8a"
-_PAPER: Final = "#b5540f"
+PAPER_COLOR: Final = "#b5540f"
 # The end of the paper's curve: plans, and success in %.
 _PAPER_PLANS: Final = 9000
-_PAPER_PERCENT: Final = PAPER_SUCCESS["gp"]["none"]
+_PAPER_PERCENT: Final = TABLE1["gp", IMITATION]["none"].percent
 
 
 def draw_figure4(points: Sequence[CurvePoint]) -> Figure:
     """Success by number of plans, and where the paper's curve ends."""
     plans = [point.num_plans for point in points]
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.8, 4.2), layout="constrained")
         axes = figure.add_subplot()
         axes.set_xlabel("number of plans imitated")
         axes.set_ylabel("tasks solved by the greedy policy (%)")
         axes.set_xlim(0, 1.04 * max(_PAPER_PLANS, *plans))
         axes.set_ylim(0, 100)
-        axes.axhline(_PAPER_PERCENT, color=_PAPER, linestyle=(0, (4, 4)), linewidth=1)
+        axes.axhline(
+            _PAPER_PERCENT, color=PAPER_COLOR, linestyle=(0, (4, 4)), linewidth=1
+        )
         # The last point may lie on the axes' edge: none is clipped.
-        axes.plot(_PAPER_PLANS, _PAPER_PERCENT, "D", color=_PAPER, clip_on=False)
+        axes.plot(_PAPER_PLANS, _PAPER_PERCENT, "D", color=PAPER_COLOR, clip_on=False)
         axes.annotate(
             f"the paper, on its own tasks: {_PAPER_PERCENT:.0f} % "
             f"with {_PAPER_PLANS} plans",
             (_PAPER_PLANS, _PAPER_PERCENT),
             xytext=(0, -9),
             textcoords="offset points",
-            color=_PAPER,
+            color=PAPER_COLOR,
             horizontalalignment="right",
             verticalalignment="top",
         )
@@ -101,7 +103,7 @@ def draw_learning_curves(
         curves: For each method, by its name, a pair a seed: gradient steps, and the
             share of tasks that is solved after them.
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.8, 4.2), layout="constrained")
         axes = figure.add_subplot()
         axes.set_xlabel("gradient steps")
@@ -123,9 +125,17 @@ def draw_learning_curves(
 
 def save_picture(figure: Figure, path: Path) -> None:
     """Writes a picture as `path` with the suffixes .svg and .png."""
-    for name in ("svg", "png"):
-        picture = io.BytesIO()
-        metadata = {"Date": None} if name == "svg" else {}
-        with matplotlib.rc_context(_STYLE):
-            figure.savefig(picture, format=name, dpi=160, metadata=metadata)
-        write_atomically(path.with_suffix(f".{name}"), picture.getvalue())
+    write_atomically(path.with_suffix(".svg"), to_svg(figure))
+    write_atomically(path.with_suffix(".png"), _save(figure, "png", {}))
+
+
+def to_svg(figure: Figure) -> str:
+    """A picture as text, the same for the same numbers."""
+    return _save(figure, "svg", {"Date": None}).decode()
+
+
+def _save(figure: Figure, name: str, metadata: dict[str, Any]) -> bytes:
+    picture = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(picture, format=name, dpi=160, metadata=metadata)
+    return picture.getvalue()

@@ -33,6 +33,30 @@ def t_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     return float(mean - half_width), float(mean + half_width)
 
 
+def mcnemar(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
+    """McNemar's exact test of whether two policies succeed equally often.
+
+    Args:
+        first: Whether the first policy succeeded in each trial, booleans (N,).
+        second: Whether the second one did in the same trials, booleans (N,).
+
+    Returns:
+        In how many trials the first alone succeeded, in how many the second alone, and
+        the p-value, two-sided: that of a fair coin's so many heads and tails.
+    """
+    first_alone = int((first & ~second).sum())
+    second_alone = int((second & ~first).sum())
+    trials = first_alone + second_alone
+    if trials == 0:
+        return 0, 0, 1.0
+    return first_alone, second_alone, float(binomtest(first_alone, trials).pvalue)
+
+
+def bonferroni(p: float, num_tests: int) -> float:
+    """A p-value that holds for the smallest of so many tests."""
+    return min(1.0, p * num_tests)
+
+
 def bootstrap_interval(
     groups: Sequence[np.ndarray], generator: np.random.Generator
 ) -> tuple[float, float]:

@@ -60,7 +60,7 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _hand_actions(
+def actions_to_pushing_pose(
     hands: np.ndarray, targets: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
     """Actions it takes the hands, about, to a pose that pushes to `place`.
@@ -68,6 +68,14 @@ def _hand_actions(
     Such a pose has the target in the hand's opening, which may point anywhere but
     back: the palm pushes forward, a finger sideways.  Outside, the hand must face
     the target to let it in.
+
+    Args:
+        hands: Poses, shape (N, 3).
+        targets: Positions of the object to push, m in W, shape (N, 2).
+        place: Where to push it to, m in W, shape (2,).
+
+    Returns:
+        Shape (N,).
     """
     way, approach = place - targets, targets - hands[:, :2]
     distance = np.linalg.norm(approach, axis=1)
@@ -155,7 +163,7 @@ class _Tree:
         targets = states[:, 3:5]
         distances = (
             np.linalg.norm(place - targets, axis=1) / TRANSLATION
-            + self._weights[0] * _hand_actions(states[:, :3], targets, place)
+            + self._weights[0] * actions_to_pushing_pose(states[:, :3], targets, place)
             + self._costs[candidates]
         )
         node = int(candidates[distances.argmin()])

@@ -5,6 +5,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from rhp_drake.task import HAND_ACTIONS, allowed_actions
+
 
 class PolicyError(Exception):
     """The policy has no action to offer; the message says why."""
@@ -58,3 +60,23 @@ class Policy(Protocol):
             PolicyError: If it has no action to offer.
         """
         ...
+
+
+def check_decidable(
+    state: np.ndarray, action_set: np.ndarray = HAND_ACTIONS
+) -> np.ndarray:
+    """Which actions a policy has to choose from, booleans of shape (A,).
+
+    Args:
+        state: Shape (3 + 3 m,).
+        action_set: The A actions it knows.
+
+    Raises:
+        PolicyError: If the state is not finite, or no action is allowed there.
+    """
+    if not np.isfinite(state).all():
+        raise PolicyError("the state is not finite.")
+    allowed = allowed_actions(state, action_set)
+    if not allowed.any():
+        raise PolicyError("no action keeps the hand in the workspace.")
+    return allowed

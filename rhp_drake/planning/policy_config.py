@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 import math
+import re
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from rhp_drake.errors import InputError
@@ -35,11 +36,7 @@ class RecedingHorizonConfig:
 
     def validate(self) -> None:
         """Raises an `InputError` that names the first impossible value."""
-        for name in ("num_roll_outs", "horizon"):
-            if getattr(self, name) < 1:
-                raise InputError(
-                    f"policy.{name} is {getattr(self, name)}; it must be at least 1."
-                )
+        _check_look_ahead(self.num_roll_outs, self.horizon)
         if not 0 < self.temperature < math.inf:
             raise InputError(
                 f"policy.temperature is {self.temperature}; it must be above 0 and "
@@ -103,6 +100,54 @@ class CheckedPlanConfig:
             )
 
 
+@dataclass(kw_only=True)
+class RandomConfig:
+    """Any allowed action, all equally likely."""
+
+    def validate(self) -> None:
+        """Nothing can be impossible."""
+
+
+@dataclass(kw_only=True)
+class PredictiveSamplingConfig:
+    """Predictive sampling with a cost made by hand; needs no network.
+
+    Attributes:
+        num_roll_outs: n, at least 1: the plan and n - 1 mutations of it.
+        horizon: h, at least 1.
+    """
+
+    num_roll_outs: int = 6
+    horizon: int = 6
+
+    def validate(self) -> None:
+        """Raises an `InputError` that names the first impossible value."""
+        _check_look_ahead(self.num_roll_outs, self.horizon)
+
+
+@dataclass(kw_only=True)
+class MppiConfig:
+    """Model predictive path integral control, as `PredictiveSamplingConfig`.
+
+    Attributes:
+        num_roll_outs: n, at least 1.
+        horizon: h, at least 1.
+    """
+
+    num_roll_outs: int = 6
+    horizon: int = 6
+
+    def validate(self) -> None:
+        """Raises an `InputError` that names the first impossible value."""
+        _check_look_ahead(self.num_roll_outs, self.horizon)
+
+
+def _check_look_ahead(num_roll_outs: int, horizon: int) -> None:
+    for name, value in (("num_roll_outs", num_roll_outs), ("horizon", horizon)):
+        if value < 1:
+            raise InputError(f"policy.{name} is {value}; it must be at least 1.")
+
+
 def _check_time_limit(value: float) -> None:
     if not 0 < value < math.inf:
         raise InputError(
@@ -111,11 +156,18 @@ def _check_time_limit(value: float) -> None:
 
 
 PolicyConfig: TypeAlias = (
-    RecedingHorizonConfig | GreedyConfig | OpenLoopConfig | CheckedPlanConfig
+    RecedingHorizonConfig
+    | GreedyConfig
+    | OpenLoopConfig
+    | CheckedPlanConfig
+    | RandomConfig
+    | PredictiveSamplingConfig
+    | MppiConfig
 )
 
-# Policies by short names: those of the paper's Table I, KDP that looks,
-# and policies that are got out of loops.
+# Policies by short names: those of the paper's Table I, KDP that looks, policies that
+# are got out of loops, and some that need no learning.  The latter, but for chance,
+# simulate as many actions a decision as rhp66.
 POLICIES: Final[dict[str, Callable[[], PolicyConfig]]] = {
     "kdp": OpenLoopConfig,
     "gp": GreedyConfig,
@@ -127,7 +179,40 @@ POLICIES: Final[dict[str, Callable[[], PolicyConfig]]] = {
         RecedingHorizonConfig, num_roll_outs=3, horizon=3, rescue=True
     ),
     "rhp66_rescue": partial(RecedingHorizonConfig, rescue=True),
+    "random": RandomConfig,
+    "ps66": partial(PredictiveSamplingConfig, num_roll_outs=6, horizon=6),
+    "mppi66": partial(MppiConfig, num_roll_outs=6, horizon=6),
 }
+
+# Policies that look ahead, by the beginnings of names such as rhp12x8.
+_FAMILIES: Final[dict[str, Callable[..., PolicyConfig]]] = {
+    "rhp": RecedingHorizonConfig,
+    "ps": PredictiveSamplingConfig,
+    "mppi": MppiConfig,
+}
+_SIZED_NAME: Final = re.compile(rf"({'|'.join(_FAMILIES)})([1-9][0-9]*)x([1-9][0-9]*)")
+
+
+def named_policy(name: str) -> PolicyConfig:
+    """The policy that a short name means.
+
+    Args:
+        name: One of `POLICIES`, or rhp<n>x<h>, ps<n>x<h> or mppi<n>x<h> for n roll-outs
+            of h actions.
+
+    Raises:
+        InputError: If it means none.
+    """
+    if name in POLICIES:
+        return POLICIES[name]()
+    sized = _SIZED_NAME.fullmatch(name)
+    if sized is None:
+        raise InputError(
+            f"{name!r} is no policy; there are {', '.join(POLICIES)}, and with n "
+            "roll-outs of h actions rhp<n>x<h>, ps<n>x<h> and mppi<n>x<h>."
+        )
+    family, num_roll_outs, horizon = sized.groups()
+    return _FAMILIES[family](num_roll_outs=int(num_roll_outs), horizon=int(horizon))
 
 
 def MakePolicy(
@@ -151,26 +236,29 @@ def MakePolicy(
     from rhp_drake.planning.checked_plan import CheckedPlan
     from rhp_drake.planning.kinodynamic_rrt import plan
     from rhp_drake.planning.open_loop import OpenLoop
+    from rhp_drake.planning.random_policy import Random
     from rhp_drake.planning.receding_horizon import RecedingHorizon
     from rhp_drake.planning.rescue import Rescued
+    from rhp_drake.planning.sampling_mpc import Mppi, PredictiveSampling
     from rhp_drake.push_model.transition import PushModel
     from rhp_drake.resources import resolve
     from rhp_drake.value.weights import load_q_network
 
     config.validate()
+    if isinstance(config, RandomConfig):
+        return Random()
+    push_model = PushModel(num_objects, num_threads)
     if isinstance(config, OpenLoopConfig):
-        return OpenLoop(
-            PushModel(num_objects, num_threads), config.time_limit, planner or plan
-        )
+        return OpenLoop(push_model, config.time_limit, planner or plan)
     if isinstance(config, CheckedPlanConfig):
         return CheckedPlan(
-            PushModel(num_objects, num_threads),
-            config.time_limit,
-            config.tolerance,
-            planner or plan,
+            push_model, config.time_limit, config.tolerance, planner or plan
         )
+    if isinstance(config, PredictiveSamplingConfig):
+        return PredictiveSampling(push_model, config.num_roll_outs, config.horizon)
+    if isinstance(config, MppiConfig):
+        return Mppi(push_model, config.num_roll_outs, config.horizon)
     q_network = load_q_network(resolve(config.q_network), num_objects)
-    push_model = PushModel(num_objects, num_threads)
     if isinstance(config, GreedyConfig):
         policy = RecedingHorizon(push_model, q_network, 0, 0, 1.0)
     else:

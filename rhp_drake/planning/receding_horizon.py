@@ -5,7 +5,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from rhp_drake.planning.policy import Decision, PolicyError
+from rhp_drake.planning.policy import Decision, check_decidable
 from rhp_drake.push_model.transition import PushModelError
 from rhp_drake.task import (
     HAND_ACTIONS,
@@ -59,9 +59,37 @@ def sample_softmax(
         generator: Draws one number a row.
     """
     weights = np.exp((q - q.max(axis=1, keepdims=True)) / temperature)
+    return sample_weighted(weights, generator)
+
+
+def sample_weighted(weights: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Draws a column for each row, as likely as its weight.
+
+    Args:
+        weights: At least 0 and not all 0 in a row, shape (N, A).
+        generator: Draws one number a row.
+    """
     cumulative = weights.cumsum(axis=1)
-    draws = generator.random(len(q)) * cumulative[:, -1]
+    draws = generator.random(len(weights)) * cumulative[:, -1]
     return (cumulative <= draws[:, None]).sum(axis=1)
+
+
+def step_distinct(
+    push_model: TransitionFunction, states: np.ndarray, actions: np.ndarray
+) -> np.ndarray:
+    """The push model's step, in which equal (state, action) pairs are simulated once.
+
+    Args:
+        push_model: T.
+        states: Shape (N, 3 + 3 m).
+        actions: Shape (N,).
+    """
+    pairs = np.column_stack([states, actions])
+    distinct, inverse = np.unique(pairs, axis=0, return_inverse=True)
+    stepped = push_model.step(
+        np.ascontiguousarray(distinct[:, :-1]), distinct[:, -1].astype(int)
+    )
+    return stepped[inverse.reshape(-1)]
 
 
 @dataclass(frozen=True)
@@ -103,11 +131,8 @@ class RecedingHorizon:
         memory: Any = None,
     ) -> Decision:
         """The first action of the best roll-out; see `policy.Policy`."""
-        if not np.isfinite(state).all():
-            raise PolicyError("the state is not finite.")
+        check_decidable(state, self.action_set)
         q = self._masked_values(state[None], goals)
-        if not np.isfinite(q).any():
-            raise PolicyError("no action keeps the hand in the workspace.")
         best = int(q[0].argmax())
         greedy = Decision(int(self.action_set[best]), float(q[0, best]))
         if self.horizon == 0:
@@ -140,7 +165,9 @@ class RecedingHorizon:
             if depth == 0:
                 first_actions = actions
             states = states.copy()
-            states[alive] = self._step_distinct(states[alive], actions[alive])
+            states[alive] = step_distinct(
+                self.push_model, states[alive], actions[alive]
+            )
             path.append(states)
             returns[alive] += self.discount**depth * REWARD
             fallen = alive & objects_fallen(states)
@@ -161,12 +188,3 @@ class RecedingHorizon:
 
     def _masked_values(self, states: np.ndarray, goals: np.ndarray) -> np.ndarray:
         return masked_values(self.value_function, states, goals, self.action_set)
-
-    def _step_distinct(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """The push model's step, in which equal pairs are simulated once."""
-        pairs = np.column_stack([states, actions])
-        distinct, inverse = np.unique(pairs, axis=0, return_inverse=True)
-        stepped = self.push_model.step(
-            np.ascontiguousarray(distinct[:, :-1]), distinct[:, -1].astype(int)
-        )
-        return stepped[inverse.reshape(-1)]

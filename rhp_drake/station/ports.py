@@ -39,17 +39,27 @@ class Port:
     simulation_only: bool = False
 
 
-STATION_PORTS: Final = (
-    Port("ur5.position", "input", NUM_JOINTS, "rad"),
-    Port("ur5.position_commanded", "output", NUM_JOINTS, "rad"),
-    Port("ur5.position_measured", "output", NUM_JOINTS, "rad"),
-    Port("ur5.velocity_estimated", "output", NUM_JOINTS, "rad/s"),
-    Port("ur5.state_estimated", "output", 2 * NUM_JOINTS, "rad, rad/s"),
-    Port("object_poses", "output", None, "list[RigidTransform], m in task order"),
-    Port("body_poses", "output", None, "list[RigidTransform]", simulation_only=True),
-    Port("contact_results", "output", None, "ContactResults", simulation_only=True),
-    Port("query_object", "output", None, "QueryObject", simulation_only=True),
-)
+def station_ports(num_objects: int) -> tuple[Port, ...]:
+    """The ports of a station of m = `num_objects` objects.
+
+    A measurement comes with its age, which in simulation is 0; `ur5.fault` is a
+    `safety.Fault` of the robot's own.
+    """
+    simulation = {"simulation_only": True}
+    return (
+        Port("ur5.position", "input", NUM_JOINTS, "rad"),
+        Port("ur5.position_commanded", "output", NUM_JOINTS, "rad"),
+        Port("ur5.position_measured", "output", NUM_JOINTS, "rad"),
+        Port("ur5.velocity_estimated", "output", NUM_JOINTS, "rad/s"),
+        Port("ur5.state_estimated", "output", 2 * NUM_JOINTS, "rad, rad/s"),
+        Port("ur5.age", "output", 1, "s"),
+        Port("ur5.fault", "output", 1, "safety.Fault"),
+        Port("object_poses", "output", None, "list[RigidTransform], m in task order"),
+        Port("object_ages", "output", num_objects, "s"),
+        Port("body_poses", "output", None, "list[RigidTransform]", **simulation),
+        Port("contact_results", "output", None, "ContactResults", **simulation),
+        Port("query_object", "output", None, "QueryObject", **simulation),
+    )
 
 
 def declared_ports(station: "System") -> set[tuple[str, str, int | None]]:

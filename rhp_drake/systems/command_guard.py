@@ -1,53 +1,61 @@
 """The last check before the robot: only safe joint commands pass."""
 
-from dataclasses import dataclass, field
-import enum
+from dataclasses import dataclass
 import math
+from typing import Final
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
+from rhp_drake.safety import Fault, JointLimits, check_command
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
+from rhp_drake.station.ur5_kinematics import PUSHING_HEIGHT, forward_kinematics
 from rhp_drake.systems.latching import latch_position
+from rhp_drake.task import WORKSPACE_LOWER, WORKSPACE_UPPER
 
-
-class Fault(enum.IntEnum):
-    """Why a command was refused."""
-
-    NONE = 0
-    NOT_FINITE = 1
-    POSITION_LIMIT = 2
-    VELOCITY_LIMIT = 3
-    TRACKING_ERROR = 4
+# The hand's z axis may lean by so much: its fingers reach 0.1 m around it.
+_LEAST_UPRIGHT: Final = math.cos(math.radians(2))
 
 
 @dataclass
-class CommandGuardConfig:
-    """The limits of `CommandGuard`.
+class CommandGuardConfig(JointLimits):
+    """The limits of `CommandGuard`, beside those of the joints.
 
     Attributes:
-        position_limits: Largest angle of each joint, either way, rad.
-        velocity_limit: Largest change of any joint's command, rad/s.  The arm itself
-            stops at pi rad/s.
-        tracking_limit: Largest distance of any measured joint from its command, rad.
+        workspace_margin: How far a command may take the hand out of its workspace, m.
+        height_tolerance: How far above or below its pushing height, m.
+        object_age_limit: How long an object may not have been seen, s.
+        arm_age_limit: How long the arm may not have been heard of, s.
     """
 
-    # The elbow turns half as far as the others.
-    position_limits: list[float] = field(
-        default_factory=lambda: [math.tau, math.tau, math.pi, *[math.tau] * 3]
-    )
-    velocity_limit: float = 1.5
-    tracking_limit: float = 0.2
+    workspace_margin: float = 0.02
+    height_tolerance: float = 0.004
+    object_age_limit: float = 0.5
+    arm_age_limit: float = 0.1
+
+    def validate(self) -> None:
+        """Raises an InputError if a limit is not positive."""
+        super().validate()
+        for name in (
+            "workspace_margin",
+            "height_tolerance",
+            "object_age_limit",
+            "arm_age_limit",
+        ):
+            value = getattr(self, name)
+            if not value > 0:
+                raise InputError(f"guard.{name} is {value}; it must be positive.")
 
 
 class CommandGuard(LeafSystem):
     """Passes joint commands on as long as they are safe.
 
-    At each tick the desired position becomes the command, unless it breaks a limit
-    of the configuration.  Then the last command is held, and the fault stays until
-    the simulator is initialized again.  The command starts as the measured position,
-    so that a first desired position far away is refused, too.
+    At each tick the desired position becomes the command, unless it breaks a limit of
+    the configuration, a measurement is too old, or the robot has a fault of its own.
+    Then the last command is held, and the fault stays until the simulator is
+    initialized again.  The command starts as the measured position, so that a first
+    desired position far away is refused, too.
 
     Initialization raises a RuntimeError if the measured position is not finite: there
     is nothing safe to command.  Before initialization the command is nan.
@@ -58,31 +66,35 @@ class CommandGuard(LeafSystem):
         input_ports:
         - position
         - position_measured
+        - arm_age
+        - arm_fault
+        - object_ages
         output_ports:
         - position
         - fault
 
-    The positions have size 6 (rad); `fault` has size 1, a value of `Fault`.
+    The positions have size 6 (rad), the ages (s) size 1 and m; `arm_fault` and `fault`
+    have size 1, a value of `safety.Fault`.
+
+    Args:
+        config: The limits.
+        num_objects: m, the target included.
     """
 
-    def __init__(self, config: CommandGuardConfig) -> None:
+    def __init__(self, config: CommandGuardConfig, num_objects: int) -> None:
         super().__init__()
-        limits = [*config.position_limits, config.velocity_limit, config.tracking_limit]
-        # Written so that nan is refused, too.
-        if len(config.position_limits) != NUM_JOINTS or not all(x > 0 for x in limits):
-            raise InputError(
-                f"the command guard needs {NUM_JOINTS} position limits, and all "
-                f"limits positive; it got {config}."
-            )
-        self._position_limits = np.array(config.position_limits)
-        self._step_limit = config.velocity_limit * COMMAND_PERIOD
-        self._tracking_limit = config.tracking_limit
-
+        config.validate()
+        self._config = config
         self._desired_port = self.DeclareVectorInputPort(
             name="position", size=NUM_JOINTS
         )
         self._measured_port = self.DeclareVectorInputPort(
             name="position_measured", size=NUM_JOINTS
+        )
+        self._arm_age_port = self.DeclareVectorInputPort(name="arm_age", size=1)
+        self._arm_fault_port = self.DeclareVectorInputPort(name="arm_fault", size=1)
+        self._object_ages_port = self.DeclareVectorInputPort(
+            name="object_ages", size=num_objects
         )
         position = self.DeclareDiscreteState(np.full(NUM_JOINTS, np.nan))
         fault = self.DeclareDiscreteState(np.array([float(Fault.NONE)]))
@@ -103,27 +115,43 @@ class CommandGuard(LeafSystem):
         if context.get_discrete_state(self._fault).value()[0] != Fault.NONE:
             return
         desired = self._desired_port.Eval(context)
-        fault = self._Check(
-            desired=desired,
-            measured=self._measured_port.Eval(context),
-            accepted=context.get_discrete_state(self._position).value(),
-        )
+        fault = self._CheckMeasurements(context)
+        if fault == Fault.NONE:
+            fault = check_command(
+                self._config,
+                COMMAND_PERIOD,
+                desired,
+                accepted=context.get_discrete_state(self._position).value(),
+                measured=self._measured_port.Eval(context),
+            )
+        if fault == Fault.NONE:
+            fault = self._CheckHand(desired)
         if fault == Fault.NONE:
             discrete_state.set_value(self._position, desired)
         else:
             discrete_state.set_value(self._fault, np.array([float(fault)]))
 
-    def _Check(
-        self, desired: np.ndarray, measured: np.ndarray, accepted: np.ndarray
-    ) -> Fault:
-        """Finds what is wrong; `accepted` is the command before, all of shape (6,)."""
-        if not (np.isfinite(desired).all() and np.isfinite(measured).all()):
-            return Fault.NOT_FINITE
-        if (np.abs(desired) > self._position_limits).any():
-            return Fault.POSITION_LIMIT
-        if (np.abs(desired - accepted) > self._step_limit).any():
-            return Fault.VELOCITY_LIMIT
-        # What was commanded before is what the arm can have reached by now.
-        if (np.abs(accepted - measured) > self._tracking_limit).any():
-            return Fault.TRACKING_ERROR
+    def _CheckMeasurements(self, context: Context) -> Fault:
+        """Finds what is wrong with the robot, or with what is known of the scene."""
+        arm_fault = Fault(int(self._arm_fault_port.Eval(context)[0]))
+        if arm_fault != Fault.NONE:
+            return arm_fault
+        # Written so that nan is too old, too.
+        if not self._arm_age_port.Eval(context)[0] <= self._config.arm_age_limit:
+            return Fault.STALE_MEASUREMENT
+        ages = self._object_ages_port.Eval(context)
+        if not (ages <= self._config.object_age_limit).all():
+            return Fault.STALE_POSE
         return Fault.NONE
+
+    def _CheckHand(self, desired: np.ndarray) -> Fault:
+        """Whether a command, shape (6,), has the hand upright where it may be."""
+        X_WH = forward_kinematics(desired)
+        margin = self._config.workspace_margin
+        inside = (
+            (X_WH[:2, 3] >= WORKSPACE_LOWER - margin).all()
+            and (X_WH[:2, 3] <= WORKSPACE_UPPER + margin).all()
+            and abs(X_WH[2, 3] - PUSHING_HEIGHT) <= self._config.height_tolerance
+            and X_WH[2, 2] >= _LEAST_UPRIGHT
+        )
+        return Fault.NONE if inside else Fault.HAND_OUTSIDE

@@ -1,0 +1,1 @@
+"""What talks to hardware: each driver in a process of its own."""

@@ -1,0 +1,343 @@
+"""A folder of results: one row an episode, in Parquet.
+
+``pandas.read_parquet(folder / "episodes")`` reads all of it.
+
+| column | type | what |
+| --- | --- | --- |
+| `policy`, `weights` | string | who decided, and its Q-network; "" if it has none |
+| `level` | string | of the physics' uncertainty: none, low, medium, high |
+| `instance` | int32 | which of the set |
+| `trial` | int32 | which of the trials on this instance; each has physics of its own |
+| `outcome` | string | "succeeded", or why it failed |
+| `succeeded` | bool | whether all objects ended in their goal regions |
+| `num_actions` | int32 | L, actions executed |
+| `actions` | list of int8 | the actions, `task.Action` |
+| `states` | list of float[3 + 3 m] | before each action and at the end |
+| `decision_seconds` | list of float | computation of each decision |
+| `world_seconds` | double | computation of the world |
+| `simulated_seconds` | double | how long it took in the world; 0 without time |
+| `ending` | string | of a failure: what was outside its goal region, and loops |
+
+All but the first two of seconds depend on the experiment alone.  The metadata of each
+file have the key "rhp_drake": JSON with commit of the code and machine.
+
+`settings.json` beside it says what all rows have in common (instances, number of
+objects, world, seed) and what each column's policy is.  A batch of episodes is a file;
+work that is stopped goes on with the batches that are not there.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from rhp_drake.errors import InputError
+from rhp_drake.evaluation.episode import Episode
+from rhp_drake.evaluation.experiment import (
+    Batch,
+    Column,
+    Experiment,
+    Trial,
+    run_batches,
+)
+from rhp_drake.files import exclusive, write_atomically
+from rhp_drake.learning.demonstration_files import lengths, numbers
+from rhp_drake.physics import UNCERTAINTY_LEVELS
+from rhp_drake.planning.policy_config import PolicyConfig
+from rhp_drake.resources import resolve
+from rhp_drake.workers import Workers
+
+_FORMAT: Final = "rhp_drake results 1"
+_SETTINGS: Final = "settings.json"
+_EPISODES: Final = "episodes"
+_METADATA_KEY: Final = b"rhp_drake"
+# Of a file, all settings but those of columns must be those of the experiment.
+_COLUMNS: Final = "columns"
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a folder holds.
+
+    Attributes:
+        settings: What all episodes have in common.
+        episodes: By policy, in the order of the settings, level, trial and instance.
+        commits: Of the code that made them.
+        machines: That made them.
+    """
+
+    settings: dict[str, Any]
+    episodes: list[tuple[Trial, Episode]]
+    commits: list[str]
+    machines: list[str]
+
+
+def run_experiment(
+    folder: Path,
+    experiment: Experiment,
+    workers: Workers,
+    commit: str = "unknown",
+    machine: str = "unknown",
+) -> Iterator[int]:
+    """Runs the batches that a folder lacks, and writes each as it is done.
+
+    Args:
+        folder: Made if need be; it may hold other columns, levels, instances and
+            trials of the same experiment.
+        experiment: What to run.
+        workers: Who runs it; this changes times alone.
+        commit: Of the code, to be noted.
+        machine: To be noted.
+
+    Yields:
+        How many of the experiment's episodes are there, at first and after each batch.
+
+    Raises:
+        InputError: If the folder is of another experiment or none, is damaged, or
+            another process works there.
+        WorkError: If a worker dies or a file cannot be written; nothing is lost.
+    """
+    _check_ours(folder)
+    with exclusive(folder):
+        settings = _merged_settings(folder, experiment)
+        write_atomically(folder / _SETTINGS, json.dumps(settings, indent=1) + "\n")
+        missing = []
+        done = 0
+        for batch in experiment.batches():
+            there = _num_rows(_path(folder, batch))
+            if there < len(batch.indices):
+                missing.append(batch)
+            else:
+                done += len(batch.indices)
+        yield done
+        about = {"commit": commit, "machine": machine}
+        for batch, episodes in run_batches(experiment, missing, workers):
+            table = _to_table(batch.trials(), episodes, about)
+            sink = pa.BufferOutputStream()
+            pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
+            write_atomically(_path(folder, batch), sink.getvalue().to_pybytes())
+            done += len(episodes)
+            yield done
+
+
+def read_results(folder: Path) -> Results:
+    """Reads all episodes of a folder.
+
+    Raises:
+        InputError: If it holds no results, or a file is damaged; the message names it.
+    """
+    settings = _read_settings(folder)
+    order = {
+        Column(entry["policy"], entry["weights"]): number
+        for number, entry in enumerate(settings[_COLUMNS])
+    }
+    levels = list(settings["levels"])
+    episodes: list[tuple[Trial, Episode]] = []
+    abouts: list[dict[str, str]] = []
+    for path in sorted((folder / _EPISODES).glob("*.parquet")):
+        table = _read_table(path)
+        episodes += _from_table(table)
+        abouts.append(json.loads(table.schema.metadata[_METADATA_KEY]))
+    if not episodes:
+        raise InputError(f"{folder}: holds no episodes yet.")
+    episodes.sort(
+        key=lambda row: (
+            order[row[0].column],
+            levels.index(row[0].level),
+            row[0].number,
+            row[0].index,
+        )
+    )
+    commits, machines = (
+        list(dict.fromkeys(about[key] for about in abouts))
+        for key in ("commit", "machine")
+    )
+    return Results(settings, episodes, commits, machines)
+
+
+def _path(folder: Path, batch: Batch) -> Path:
+    """Of a batch, by its first instance: more instances of a set go on from there."""
+    column = "_".join(filter(None, (batch.column.policy, batch.column.weights)))
+    name = f"{column}_{batch.level}_{batch.number:02d}_{batch.indices.start:03d}"
+    return folder / _EPISODES / f"{name}.parquet"
+
+
+def _check_ours(folder: Path) -> None:
+    """Raises InputError if there is a folder with something else in it."""
+    if not folder.exists() or (folder / _SETTINGS).exists():
+        return
+    if not folder.is_dir() or any(not p.name.startswith("_") for p in folder.iterdir()):
+        raise InputError(
+            f"{folder}: is no folder of results (there is no {_SETTINGS}), nor empty; "
+            "choose another one."
+        )
+
+
+def _merged_settings(folder: Path, experiment: Experiment) -> dict[str, Any]:
+    """The settings of folder and experiment.
+
+    Raises:
+        InputError: If they do not agree.
+    """
+    ours: dict[str, Any] = {
+        "format": _FORMAT,
+        "world": experiment.world,
+        "instances": experiment.instances,
+        "num_objects": experiment.num_objects,
+        "seed": experiment.seed,
+        "levels": list(experiment.levels),
+        _COLUMNS: [_describe(*item) for item in experiment.columns.items()],
+    }
+    if not (folder / _SETTINGS).exists():
+        return ours
+    noted = _read_settings(folder)
+    for name in ("world", "instances", "num_objects", "seed"):
+        if noted[name] != ours[name]:
+            raise InputError(
+                f"{folder}: holds results of {name} {noted[name]!r}, not "
+                f"{ours[name]!r}; choose another folder."
+            )
+    columns = {(c["policy"], c["weights"]): c for c in noted[_COLUMNS]}
+    for column in ours[_COLUMNS]:
+        key = column["policy"], column["weights"]
+        if columns.setdefault(key, column) != column:
+            raise InputError(
+                f"{folder}: holds results of another policy {' '.join(key).strip()!r} "
+                f"({columns[key]}, not {column}); choose another folder."
+            )
+    known = {*noted["levels"], *ours["levels"]}
+    levels = [level for level in UNCERTAINTY_LEVELS if level in known]
+    return ours | {"levels": levels, _COLUMNS: list(columns.values())}
+
+
+def _describe(column: Column, config: PolicyConfig) -> dict[str, Any]:
+    """All that a column's episodes depend on; of its weights the file's checksum."""
+    values = dict(vars(config))
+    uri = values.pop("q_network", None)
+    if uri is not None:
+        values["q_network_sha256"] = _checksum(resolve(uri))
+    return {"policy": column.policy, "weights": column.weights, **values}
+
+
+def _checksum(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}.") from None
+
+
+def _read_settings(folder: Path) -> dict[str, Any]:
+    path = folder / _SETTINGS
+    try:
+        settings = dict(json.loads(path.read_text()))
+        if settings["format"] != _FORMAT:
+            raise InputError(
+                f"{path}: has the format {settings['format']!r}, not {_FORMAT!r}."
+            )
+        wanted = {"world", "instances", "num_objects", "seed", "levels", _COLUMNS}
+        if lacking := wanted - set(settings):
+            raise InputError(f"{path}: lacks {min(lacking)!r}.")
+    except FileNotFoundError:
+        raise InputError(
+            f"{folder}: is no folder of results: there is no {_SETTINGS}."
+        ) from None
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not readable settings ({error}).") from error
+    return settings
+
+
+def _schema(num_values: int, about: dict[str, str]) -> pa.Schema:
+    """The columns described above, for states of so many values."""
+    return pa.schema(
+        {
+            "policy": pa.string(),
+            "weights": pa.string(),
+            "level": pa.string(),
+            "instance": pa.int32(),
+            "trial": pa.int32(),
+            "outcome": pa.string(),
+            "succeeded": pa.bool_(),
+            "num_actions": pa.int32(),
+            "actions": pa.list_(pa.int8()),
+            "states": pa.list_(pa.list_(pa.float32(), num_values)),
+            "decision_seconds": pa.list_(pa.float32()),
+            "world_seconds": pa.float64(),
+            "simulated_seconds": pa.float64(),
+            "ending": pa.string(),
+        },
+        metadata={_METADATA_KEY: json.dumps(about).encode()},
+    )
+
+
+def _to_table(
+    trials: Sequence[Trial], episodes: Sequence[Episode], about: dict[str, str]
+) -> pa.Table:
+    rows = [
+        {
+            "policy": trial.column.policy,
+            "weights": trial.column.weights,
+            "level": trial.level,
+            "instance": trial.index,
+            "trial": trial.number,
+            "outcome": episode.outcome,
+            "succeeded": episode.succeeded,
+            "num_actions": episode.num_actions,
+            "actions": list(episode.actions),
+            "states": list(episode.states.astype(np.float32)),
+            "decision_seconds": list(episode.decision_seconds),
+            "world_seconds": episode.world_seconds,
+            "simulated_seconds": episode.simulated_seconds,
+            "ending": episode.ending,
+        }
+        for trial, episode in zip(trials, episodes, strict=True)
+    ]
+    schema = _schema(episodes[0].states.shape[1], about)
+    return pa.Table.from_pylist(rows, schema=schema)
+
+
+def _from_table(table: pa.Table) -> Iterator[tuple[Trial, Episode]]:
+    ends = np.cumsum(lengths(table["states"]))
+    states_of_rows = np.split(numbers(table["states"]), ends[:-1])
+    rows = table.drop_columns("states").to_pylist()
+    for row, states in zip(rows, states_of_rows, strict=True):
+        column = Column(row["policy"], row["weights"])
+        yield (
+            Trial(column, row["level"], row["instance"], row["trial"]),
+            Episode(
+                row["outcome"],
+                row["actions"],
+                states,
+                row["decision_seconds"],
+                row["world_seconds"],
+                row["simulated_seconds"],
+                row["ending"],
+            ),
+        )
+
+
+def _read_table(path: Path) -> pa.Table:
+    try:
+        # Checksums are verified on the way.
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        if _METADATA_KEY not in (file.schema_arrow.metadata or {}):
+            raise InputError(f"{path}: its metadata know of no results.")
+        return file.read()
+    except InputError:
+        raise
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise InputError(
+            f"{path}: not a readable file of results ({error})."
+        ) from error
+
+
+def _num_rows(path: Path) -> int:
+    """How many episodes a file holds, 0 if it is not there."""
+    return _read_table(path).num_rows if path.exists() else 0

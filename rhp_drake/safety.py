@@ -1,0 +1,113 @@
+"""What stops the robot: limits on joint commands, and the names of faults.
+
+The command guard in the diagram and the driver beside it check alike, so that neither
+has to trust the other.  Needs NumPy alone.
+"""
+
+from dataclasses import dataclass, field
+import enum
+import math
+from typing import Final
+
+import numpy as np
+
+from rhp_drake.errors import InputError
+
+_NUM_JOINTS: Final = 6
+
+
+class Fault(enum.IntEnum):
+    """Why the arm was stopped; it stays stopped until the run is started anew."""
+
+    NONE = 0
+    NOT_FINITE = 1
+    POSITION_LIMIT = 2
+    VELOCITY_LIMIT = 3
+    TRACKING_ERROR = 4
+    HAND_OUTSIDE = 5
+    STALE_POSE = 6
+    STALE_MEASUREMENT = 7
+    STALE_COMMAND = 8
+    PROTECTIVE_STOP = 9
+    EMERGENCY_STOP = 10
+    NOT_RUNNING = 11
+    CONNECTION_LOST = 12
+
+
+_SENTENCES: Final = {
+    Fault.NONE: "nothing is wrong.",
+    Fault.NOT_FINITE: "a command or a measured joint position is not finite.",
+    Fault.POSITION_LIMIT: "a command is beyond a joint's position limit.",
+    Fault.VELOCITY_LIMIT: "a command is too far from the one before.",
+    Fault.TRACKING_ERROR: "a joint is too far from where it was commanded.",
+    Fault.HAND_OUTSIDE: "a command takes the hand out of its workspace or height.",
+    Fault.STALE_POSE: "an object has not been seen for too long.",
+    Fault.STALE_MEASUREMENT: "the arm has not been heard of for too long.",
+    Fault.STALE_COMMAND: "no command came in time.",
+    Fault.PROTECTIVE_STOP: "the robot is in a protective stop.",
+    Fault.EMERGENCY_STOP: "the robot's emergency stop is pressed.",
+    Fault.NOT_RUNNING: "the robot is off, or its program does not run.",
+    Fault.CONNECTION_LOST: "the connection to the robot is lost.",
+}
+
+
+def describe(fault: Fault) -> str:
+    """What is wrong, as half a sentence with its full stop."""
+    return _SENTENCES[fault]
+
+
+@dataclass
+class JointLimits:
+    """Limits on what is commanded to the joints.
+
+    Attributes:
+        position_limits: Largest angle of each joint, either way, rad.
+        velocity_limit: Largest speed of any joint's command, rad/s.  The arm itself
+            stops at pi rad/s.
+        tracking_limit: Largest distance of any measured joint from its command, rad.
+    """
+
+    # The elbow turns half as far as the others.
+    position_limits: list[float] = field(
+        default_factory=lambda: [math.tau, math.tau, math.pi, *[math.tau] * 3]
+    )
+    velocity_limit: float = 1.5
+    tracking_limit: float = 0.2
+
+    def validate(self) -> None:
+        """Raises an InputError unless there are six position limits, all positive."""
+        limits = [*self.position_limits, self.velocity_limit, self.tracking_limit]
+        # Written so that nan is refused, too.
+        if len(self.position_limits) != _NUM_JOINTS or not all(x > 0 for x in limits):
+            raise InputError(
+                f"the joint limits need {_NUM_JOINTS} position limits, and all "
+                f"positive; they are {self}."
+            )
+
+
+def check_command(
+    limits: JointLimits,
+    period: float,
+    desired: np.ndarray,
+    accepted: np.ndarray,
+    measured: np.ndarray,
+) -> Fault:
+    """Finds what is wrong with a joint command.
+
+    Args:
+        limits: What is allowed.
+        period: Time from command to command, s.
+        desired: The command, shape (6,), rad.
+        accepted: The one before it, shape (6,), rad.
+        measured: Where the joints are, shape (6,), rad.
+    """
+    if not (np.isfinite(desired).all() and np.isfinite(measured).all()):
+        return Fault.NOT_FINITE
+    if (np.abs(desired) > limits.position_limits).any():
+        return Fault.POSITION_LIMIT
+    if (np.abs(desired - accepted) > limits.velocity_limit * period).any():
+        return Fault.VELOCITY_LIMIT
+    # What was commanded before is what the arm can have reached by now.
+    if (np.abs(accepted - measured) > limits.tracking_limit).any():
+        return Fault.TRACKING_ERROR
+    return Fault.NONE

@@ -1,0 +1,345 @@
+"""Tests of rhp_drake.drivers.natnet_driver and rhp_drake.lab.natnet_server."""
+
+import math
+import multiprocessing
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.math import RigidTransform, RollPitchYaw
+import pytest
+
+from rhp_drake.drivers.natnet_driver import NatNetConfig, NatNetDriver, PoseConfig
+from rhp_drake.errors import InputError, WorkError
+from rhp_drake.lab.natnet_server import Freeze, NatNetServer
+from rhp_drake.random_streams import stream
+
+pytest.importorskip("natnet")
+
+PATIENCE = 60  # s: a busy machine may take long, but not for ever.
+TARGET, OBSTACLE = "target box", "obstacle"
+X_TARGET = RigidTransform(RollPitchYaw(0.1, -0.2, 0.3), [1.0, 2.0, 3.0])
+X_OBSTACLE = RigidTransform([-0.5, 0.25, 0.125])
+
+
+def make_server(port=0):
+    return NatNetServer(stream(0, "natnet"), command_port=port)
+
+
+@pytest.fixture
+def server():
+    server = make_server()
+    server.set_bodies([(OBSTACLE, X_OBSTACLE), (TARGET, X_TARGET)])
+    server.start()
+    yield server
+    server.stop()
+
+
+def make_driver(server, **kwargs):
+    config = NatNetConfig(command_port=server.command_port, bodies=[TARGET, OBSTACLE])
+    for name, value in kwargs.items():
+        setattr(config, name, value)
+    return NatNetDriver(config)
+
+
+@pytest.fixture
+def driver(server):
+    driver = make_driver(server)
+    driver.start()
+    wait_for(lambda: all(pose.tracked for pose in driver.read()))
+    yield driver
+    driver.stop()
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def is_at(pose, X_WB):
+    # The stream has float32.
+    return pose.X_WB.IsNearlyEqualTo(X_WB, 1e-6)
+
+
+def wait_for_frames(driver, count=5):
+    """Waits until so many frames have come in which the obstacle was tracked."""
+    start = driver.read()[1].frame
+    wait_for(lambda: driver.read()[1].frame >= start + count)
+
+
+def test_poses_come_in_the_tasks_order(driver):
+    target, obstacle = driver.read()
+    assert is_at(target, X_TARGET)
+    assert is_at(obstacle, X_OBSTACLE)
+    assert 0 <= target.age < PATIENCE
+
+
+def test_both_calibrations(server):
+    # O is turned by a quarter about z; R stands on the box's face, 3 cm up, and is
+    # rolled by half a turn.
+    driver = make_driver(
+        server,
+        X_WO=PoseConfig(xyz=[0.5, -0.1, 0.2], rpy_deg=[0.0, 0.0, 90.0]),
+        X_RB={TARGET: PoseConfig(xyz=[0.0, 0.0, 0.03], rpy_deg=[180.0, 0.0, 0.0])},
+    )
+    server.set_bodies(
+        [
+            (TARGET, RigidTransform(RollPitchYaw(math.pi, 0, 0), [0.3, 0.4, 0.06])),
+            (OBSTACLE, RigidTransform(RollPitchYaw(0, 0, 0.5), [0.1, 0.0, 0.0])),
+        ]
+    )
+    driver.start()
+    try:
+        wait_for(lambda: all(pose.tracked for pose in driver.read()))
+        target, obstacle = driver.read()
+    finally:
+        driver.stop()
+    # R's z points down, so the box's centre is at z = 0.06 - 0.03 in O.
+    quarter = RollPitchYaw(0, 0, math.pi / 2)
+    assert is_at(target, RigidTransform(quarter, [0.5 - 0.4, -0.1 + 0.3, 0.2 + 0.03]))
+    turned = RollPitchYaw(0, 0, math.pi / 2 + 0.5)
+    assert is_at(obstacle, RigidTransform(turned, [0.5, -0.1 + 0.1, 0.2]))
+
+
+def test_follows_movement(driver, server):
+    for x in np.linspace(0.0, 0.1, 3):
+        X = RigidTransform([x, 0.0, 0.0])
+        server.set_bodies([(TARGET, X), (OBSTACLE, X_OBSTACLE)])
+        wait_for(lambda X=X: is_at(driver.read()[0], X))
+
+
+@pytest.mark.parametrize("freeze", [Freeze.REPEAT, Freeze.SILENT])
+def test_age_grows_while_the_stream_is_frozen(driver, server, freeze):
+    server.freeze = freeze
+    # Longer than it takes to connect anew.
+    wait_for(lambda: driver.read()[0].age > 2.5)
+    target, obstacle = driver.read()
+    assert obstacle.age > 2.5
+    assert is_at(target, X_TARGET)
+    server.freeze = Freeze.NONE
+    wait_for(lambda: driver.read()[0].age < 0.5)
+
+
+@pytest.mark.parametrize("zero", [False, True])
+def test_an_occluded_body_keeps_its_pose(driver, server, zero):
+    server.occlude(TARGET, zero=zero)
+    wait_for(lambda: not driver.read()[0].tracked)
+    frame = driver.read()[0].frame
+    wait_for_frames(driver)
+    target, obstacle = driver.read()
+    assert not target.tracked
+    assert target.frame == frame
+    assert target.age > obstacle.age
+    assert is_at(target, X_TARGET)
+    assert obstacle.tracked
+    server.reveal(TARGET)
+    wait_for(lambda: driver.read()[0].tracked)
+
+
+def test_a_body_that_is_not_in_the_frames(driver, server):
+    server.set_bodies([(OBSTACLE, X_OBSTACLE)])
+    wait_for(lambda: not driver.read()[0].tracked)
+    # Also once the definitions lack it.
+    time.sleep(1.5)
+    wait_for_frames(driver)
+    target, obstacle = driver.read()
+    assert not target.tracked
+    assert obstacle.tracked
+
+
+def test_swapped_bodies(driver, server):
+    server.swap(TARGET, OBSTACLE)
+    wait_for(lambda: is_at(driver.read()[0], X_OBSTACLE))
+    assert is_at(driver.read()[1], X_TARGET)
+    server.swap(TARGET, OBSTACLE)
+    wait_for(lambda: is_at(driver.read()[0], X_TARGET))
+
+
+def test_numbers_that_are_not_finite(driver, server):
+    server.not_finite.add(TARGET)
+    wait_for(lambda: not driver.read()[0].tracked)
+    target, obstacle = driver.read()
+    assert is_at(target, X_TARGET)
+    assert obstacle.tracked
+    server.not_finite.clear()
+    wait_for(lambda: driver.read()[0].tracked)
+
+
+def test_malformed_datagrams(driver, server):
+    server.malformed_share = 0.5
+    wait_for(lambda: driver.num_malformed > 20)
+    wait_for_frames(driver)
+    server.malformed_share = 1.0
+    malformed = driver.num_malformed
+    # They are no frames: the age grows.
+    wait_for(lambda: driver.num_malformed > malformed + 20)
+    wait_for(lambda: driver.read()[0].age > 0.5)
+    server.malformed_share = 0.0
+    wait_for_frames(driver)
+    assert is_at(driver.read()[0], X_TARGET)
+    assert is_at(driver.read()[1], X_OBSTACLE)
+
+
+def test_lost_and_late_frames(driver, server):
+    server.drop_share, server.delay, server.jitter = 0.5, 0.05, 0.05
+    frames = []
+
+    def enough():
+        frames.append(driver.read()[0].frame)
+        return len(set(frames)) > 20
+
+    wait_for(enough)
+    # One that was overtaken is not taken.
+    assert frames == sorted(frames)
+
+
+def test_survives_a_restart_of_the_server(driver, server):
+    server.stop()
+    wait_for(lambda: driver.read()[0].age > 1.5)
+    # Its ids are others.
+    other = make_server(server.command_port)
+    X = RigidTransform([7.0, 8.0, 9.0])
+    other.set_bodies([("new", X), (TARGET, X), (OBSTACLE, X_OBSTACLE)])
+    other.start()
+    try:
+        wait_for(lambda: is_at(driver.read()[0], X))
+        wait_for(lambda: is_at(driver.read()[1], X_OBSTACLE))
+    finally:
+        other.stop()
+
+
+def test_starts_again(driver, server):
+    with pytest.raises(RuntimeError, match="is running"):
+        driver.start()
+    driver.stop()
+    driver.stop()
+    assert is_at(driver.read()[0], X_TARGET)
+    frame = driver.read()[0].frame
+    driver.start()
+    wait_for(lambda: driver.read()[0].frame > frame)
+
+
+def test_before_the_start(server):
+    driver = make_driver(server)
+    for pose in driver.read():
+        assert not pose.tracked
+        assert pose.age == math.inf
+        assert pose.frame == -1
+        assert np.isnan(pose.X_WB.translation()).all()
+    assert driver.num_malformed == 0
+    driver.stop()
+
+
+def test_unknown_body(server):
+    driver = make_driver(server, bodies=[TARGET, "red box"])
+    with pytest.raises(InputError) as error:
+        driver.start()
+    assert str(error.value) == (
+        "Motive has no rigid body 'red box'; it has 'obstacle', 'target box'."
+    )
+    assert not multiprocessing.active_children()
+
+
+def test_nobody_answers(server):
+    server.stop()
+    driver = make_driver(server)
+    with pytest.raises(WorkError, match=r"no NatNet server at .*: nobody answers\."):
+        driver.start()
+    assert not multiprocessing.active_children()
+
+
+def test_an_address_that_is_not_ours(server):
+    # One of TEST-NET-1.
+    driver = make_driver(server, local_address="192.0.2.1")
+    with pytest.raises(WorkError, match=r"no NatNet server at .* assign"):
+        driver.start()
+
+
+def test_a_taken_port(server):
+    with pytest.raises(InputError, match="no NatNet server can be at"):
+        make_server(server.command_port)
+
+
+def test_ends_with_the_object(server):
+    driver = make_driver(server)
+    driver.start()
+    assert len(multiprocessing.active_children()) == 1
+    del driver
+    assert not multiprocessing.active_children()
+
+
+PARENT = """
+import multiprocessing, os, signal, sys
+from rhp_drake.drivers.natnet_driver import NatNetConfig, NatNetDriver
+
+if __name__ == "__main__":
+    port, body = int(sys.argv[1]), sys.argv[2]
+    driver = NatNetDriver(NatNetConfig(command_port=port, bodies=[body]))
+    driver.start()
+    print(multiprocessing.active_children()[0].pid, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def is_running(pid):
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False
+    # Nobody may have buried it.
+    return status.rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_dies_with_its_parent(server, tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT)
+    command = [sys.executable, script, str(server.command_port), TARGET]
+    parent = subprocess.run(
+        command, stdout=subprocess.PIPE, text=True, timeout=PATIENCE, check=False
+    )
+    assert parent.returncode == -signal.SIGKILL
+    wait_for(lambda: not is_running(int(parent.stdout)))
+
+
+def test_config_loads_from_yaml():
+    config = yaml_load_typed(
+        schema=NatNetConfig,
+        data="""
+            server_address: 192.168.1.10
+            bodies: [a, b]
+            X_WO: {rpy_deg: [0, 0, 90]}
+            X_RB: {b: {xyz: [0, 0, -0.03]}}
+        """,
+        defaults=NatNetConfig(),
+    )
+    assert config == NatNetConfig(
+        server_address="192.168.1.10",
+        bodies=["a", "b"],
+        X_WO=PoseConfig(rpy_deg=[0.0, 0.0, 90.0]),
+        X_RB={"b": PoseConfig(xyz=[0.0, 0.0, -0.03])},
+    )
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (NatNetConfig(), "different names"),
+        (NatNetConfig(bodies=["a", "a"]), "different names"),
+        (NatNetConfig(bodies=["a"], X_RB={"b": PoseConfig()}), "X_RB"),
+        (NatNetConfig(bodies=["a"], X_WO=PoseConfig(xyz=[0.0])), "finite"),
+        (
+            NatNetConfig(bodies=["a"], X_RB={"a": PoseConfig(xyz=[0, 0, math.nan])}),
+            "finite",
+        ),
+    ],
+)
+def test_bad_config(config, message):
+    with pytest.raises(InputError, match=message):
+        NatNetDriver(config)
