@@ -12,7 +12,17 @@ from rhp_drake.value.q_network import PaperQNetwork
 from rhp_drake.value.weights import save_q_network
 
 COMMANDS = (
-    *("run", "plan", "demos", "imitate", "reinforce", "evaluate", "report"),
+    *(
+        "run",
+        "lab",
+        "calibrate",
+        "plan",
+        "demos",
+        "imitate",
+        "reinforce",
+        "evaluate",
+        "report",
+    ),
     *("figure4", "bench"),
 )
 

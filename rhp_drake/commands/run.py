@@ -1,5 +1,6 @@
 """`rhp run`: one task in closed loop, in the full diagram of the robot."""
 
+from contextlib import ExitStack
 from dataclasses import asdict
 import json
 import os
@@ -10,7 +11,7 @@ import typer
 
 from rhp_drake.commands import task_run
 from rhp_drake.errors import InputError
-from rhp_drake.planning.policy_config import POLICIES
+from rhp_drake.planning.policy_config import POLICIES, named_policy
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -25,7 +26,17 @@ def run(
     seed: task_run.Seed = None,
     policy: Annotated[
         str | None,
-        typer.Option(help=f"Instead of the scenario's: {', '.join(POLICIES)}."),
+        typer.Option(
+            help=f"Instead of the scenario's: {', '.join(POLICIES)}; or with n "
+            "roll-outs of h actions, such as rhp16x8."
+        ),
+    ] = None,
+    hardware: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run on the robot and the tracker of this file, or bundled name, e.g. "
+            "virtual_lab."
+        ),
     ] = None,
     scenario_text: task_run.ScenarioText = None,
     realtime: task_run.Realtime = True,
@@ -43,8 +54,6 @@ def run(
     Writes run.json and, with Meshcat, recording.html.  The exit status is 0 if the
     task succeeded, 1 if it failed, 2 for bad input, 130 after Ctrl-C.
     """
-    if policy is not None and policy not in POLICIES:
-        raise InputError(f"--policy: {policy!r} is not one of {', '.join(POLICIES)}.")
     overrides = [
         text
         for text in (
@@ -62,13 +71,13 @@ def run(
         _write_graphviz(config, graphviz)
         return
     folder = out or task_run.default_folder()
-    outcome = _run(title, config, realtime, meshcat, folder)
+    outcome = _run(title, config, realtime, meshcat, folder, hardware)
     raise typer.Exit(task_run.exit_status(outcome))
 
 
 def _policy_text(name: str) -> str:
     """A policy as scenario text, which leaves the weights as they are."""
-    config = POLICIES[name]()
+    config = named_policy(name)
     values = {k: v for k, v in asdict(config).items() if k != "q_network"}
     return f"policy: !{type(config).__name__} {json.dumps(values)}"
 
@@ -93,11 +102,13 @@ def _run(
     realtime: bool,
     use_meshcat: bool,
     folder: Path,
+    hardware_file: Path | None,
 ) -> "Outcome":
     """Runs the scenario, says what happens, and writes the results to `folder`."""
     import torch
 
     from rhp_drake.files import make_folder
+    from rhp_drake.hardware import load_hardware, running_hardware
     from rhp_drake.planning.policy_config import MakePolicy
 
     # As everywhere else: the same bits on machines of more cores.
@@ -107,13 +118,24 @@ def _run(
         len(scenario.station.objects),
         num_threads=os.cpu_count() or 1,
     )
+    config = load_hardware(hardware_file) if hardware_file is not None else None
     meshcat = task_run.start_meshcat(scenario) if use_meshcat else None
-    simulator = task_run.make_simulator(scenario, policy, meshcat, realtime)
-    make_folder(folder)
     console = task_run.make_console()
-    task_run.say_title(console, title, scenario, meshcat)
-    with task_run.recorded(meshcat, folder):
-        run = task_run.run_task(simulator, scenario, console)
+    with ExitStack() as stack:
+        running = None
+        if config is not None:
+            console.print(f"Connecting to {config.description or hardware_file}")
+            m = len(scenario.station.objects)
+            running = stack.enter_context(running_hardware(config, m))
+        simulator = task_run.make_simulator(
+            scenario, policy, meshcat, realtime, running
+        )
+        make_folder(folder)
+        task_run.say_title(console, title, scenario, meshcat)
+        stack.enter_context(task_run.recorded(meshcat, folder))
+        run = task_run.run_task(
+            simulator, scenario, console, on_hardware=running is not None
+        )
     task_run.write_run(run, scenario, folder)
     task_run.say_outcome(console, run, folder)
     return run.outcome

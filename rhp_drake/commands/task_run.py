@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pydrake.systems.analysis import Simulator
     from rich.console import Console
 
+    from rhp_drake.closed_loop import Hardware
     from rhp_drake.planning.policy import Policy
     from rhp_drake.run_closed_loop import Outcome
     from rhp_drake.scenario import Scenario
@@ -81,15 +82,20 @@ def start_meshcat(scenario: "Scenario") -> "Meshcat":
 
 
 def make_simulator(
-    scenario: "Scenario", policy: "Policy", meshcat: "Meshcat | None", realtime: bool
+    scenario: "Scenario",
+    policy: "Policy",
+    meshcat: "Meshcat | None",
+    realtime: bool,
+    hardware: "Hardware | None" = None,
 ) -> "Simulator":
     """A simulator of the closed loop; see `MakeClosedLoop`."""
     from pydrake.systems.analysis import Simulator
 
     from rhp_drake.closed_loop import MakeClosedLoop
 
-    simulator = Simulator(MakeClosedLoop(scenario, policy, meshcat))
-    if realtime:
+    simulator = Simulator(MakeClosedLoop(scenario, policy, meshcat, hardware))
+    # On hardware time is that of the robot; see `run_on_hardware`.
+    if realtime and hardware is None:
         simulator.set_target_realtime_rate(1.0)
     return simulator
 
@@ -126,6 +132,7 @@ def run_task(
     scenario: "Scenario",
     console: "Console",
     on_decision: "Callable[[DecisionRecord], None]" = lambda record: None,
+    on_hardware: bool = False,
 ) -> TaskRun:
     """Runs the scenario's task to its end, or to the user's, and says each decision.
 
@@ -134,18 +141,11 @@ def run_task(
         scenario: Says which task and physics.
         console: Where to say it.
         on_decision: Called soon after each decision, before it is said.
+        on_hardware: Whether the task begins where robot and objects are; of the
+            scenario's task the target's goal alone counts.
     """
-    from rhp_drake.physics import draw_physics
-    from rhp_drake.random_streams import stream
-    from rhp_drake.run_closed_loop import Outcome, run_closed_loop
-    from rhp_drake.scenario import make_task_instance
+    from rhp_drake.run_closed_loop import Outcome
 
-    instance = make_task_instance(scenario)
-    physics = draw_physics(
-        scenario.world_physics,
-        instance.initial_state,
-        stream(scenario.seed, "world_physics"),
-    )
     decisions: list[DecisionRecord] = []
 
     def note_decision(record: "DecisionRecord") -> None:
@@ -158,14 +158,7 @@ def run_task(
 
     started, clock = datetime.now().astimezone(), time.perf_counter()
     try:
-        outcome = run_closed_loop(
-            simulator,
-            instance,
-            physics,
-            seed=scenario.seed,
-            time_limit=scenario.time_limit,
-            on_decision=note_decision,
-        )
+        outcome = _run(simulator, scenario, note_decision, on_hardware)
     except KeyboardInterrupt:
         # What has happened so far is worth keeping.
         outcome = Outcome(
@@ -178,6 +171,41 @@ def run_task(
     seconds = time.perf_counter() - clock
     times = {"started": started.isoformat(timespec="seconds"), "seconds": seconds}
     return TaskRun(outcome, decisions, times)
+
+
+def _run(
+    simulator: "Simulator",
+    scenario: "Scenario",
+    on_decision: "Callable[[DecisionRecord], None]",
+    on_hardware: bool,
+) -> "Outcome":
+    from rhp_drake.physics import draw_physics
+    from rhp_drake.random_streams import stream
+    from rhp_drake.run_closed_loop import run_closed_loop, run_on_hardware
+    from rhp_drake.scenario import make_task_instance
+
+    instance = make_task_instance(scenario)
+    if on_hardware:
+        return run_on_hardware(
+            simulator,
+            instance.goals[0],
+            seed=scenario.seed,
+            time_limit=scenario.time_limit,
+            on_decision=on_decision,
+        )
+    physics = draw_physics(
+        scenario.world_physics,
+        instance.initial_state,
+        stream(scenario.seed, "world_physics"),
+    )
+    return run_closed_loop(
+        simulator,
+        instance,
+        physics,
+        seed=scenario.seed,
+        time_limit=scenario.time_limit,
+        on_decision=on_decision,
+    )
 
 
 def write_run(run: TaskRun, scenario: "Scenario", folder: Path) -> None:

@@ -176,7 +176,8 @@ class NatNetDriver:
             raise RuntimeError("the NatNet driver is running.")
         if importlib.util.find_spec("natnet") is None:
             raise InputError(
-                "OptiTrack needs natnet: pip install -c constraints.txt natnet."
+                "OptiTrack needs natnet: pip install -c constraints.txt "
+                '-e ".[hardware]".'
             )
         # Drake and torch start threads, which a forked child would inherit broken.
         context = multiprocessing.get_context("spawn")
@@ -274,9 +275,31 @@ def _follow_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def _make_natnet_doubt_counts() -> None:
+    """Makes natnet raise an error where a datagram counts more than it contains.
+
+    natnet 0.3 would take gigabytes, or minutes, before it finds out.
+    """
+    from natnet import nat_net_client
+
+    class BoundedBuffer(nat_net_client.PacketBuffer):
+        def read_float32_array(self, count: int) -> tuple[float, ...]:
+            if self.pointer + 4 * count > len(self.data):
+                raise ValueError(f"no {count} numbers are left")
+            return super().read_float32_array(count)
+
+        def read_string(self, *args: Any, **kwargs: Any) -> str:
+            if self.pointer >= len(self.data):
+                raise ValueError("no text is left")
+            return super().read_string(*args, **kwargs)
+
+    nat_net_client.PacketBuffer = BoundedBuffer
+
+
 def _receive(config: NatNetConfig, vector: SharedVector, answer: Connection) -> None:
     """What the driver's process does, until it is killed."""
     _follow_parent()
+    _make_natnet_doubt_counts()
     # natnet prints a line for each odd datagram.
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
         _Receiver(config, vector, answer).run()

@@ -36,6 +36,7 @@ _UNUSED: Final = 0.5
 _DECELERATION: Final = 8.0
 # Hz: the controller stops by itself when it hears less often from us.
 _WATCHDOG_FREQUENCY: Final = 10.0
+_CB3_PERIOD: Final = 0.008  # s
 # RTDE guide of Universal Robots: robot and safety modes, and a program that runs.
 _ROBOT_RUNNING: Final = 7
 _SAFETY_NORMAL: Final = (1, 2)  # Normal, reduced.
@@ -49,6 +50,15 @@ _VARIABLES: Final = [
     "safety_mode",
     "runtime_state",
 ]
+# Faults in which the robot is well and waits for what it is told.
+_OURS: Final = (
+    Fault.NOT_FINITE,
+    Fault.POSITION_LIMIT,
+    Fault.VELOCITY_LIMIT,
+    Fault.TRACKING_ERROR,
+    Fault.STALE_COMMAND,
+)
+
 # Layout of the shared vectors.
 _COMMAND_SIZE: Final = 1 + NUM_JOINTS  # Whether engaged, positions.
 # q, qd, when they came (time.monotonic), fault, cycles, longest cycle.
@@ -157,6 +167,11 @@ class UrDriver:
             ),
             daemon=True,
         )
+
+    @property
+    def pid(self) -> int | None:
+        """Of the driver's process; None before the start."""
+        return self._process.pid
 
     def start(self) -> None:
         """Connects, and returns once the robot has told where it is.
@@ -283,18 +298,25 @@ class _Stream:
             except (RuntimeError, ValueError):
                 # What the library throws when it has lost the robot.
                 fault = Fault.CONNECTION_LOST
-            if fault != Fault.NONE and self._fault == Fault.NONE:
+            new_fault = fault != self._fault == Fault.NONE
+            if new_fault:
                 self._fault = fault
-                self._brake()
             if self._config.dry_run and self._accepted is not None:
                 position = self._accepted
             # A frozen stream looks old, whatever is read from it.
             rest = [heard_at, self._fault, self._cycles, self._longest_cycle]
             self._measurements.write(np.concatenate([position, velocity, rest]))
+            if self._fault == Fault.CONNECTION_LOST:
+                # The library would connect anew and upload its program again and again.
+                return
+            # After it was told: to stop takes a while.
+            if new_fault and fault in _OURS:
+                self._brake()
             # Late once, it is not early afterwards.
             cycle = max(cycle + self._period, time.monotonic())
             time.sleep(max(0.0, cycle - time.monotonic()))
-        self._brake()
+        if self._fault == Fault.NONE:
+            self._brake()
 
     def _connect(self) -> None:
         from rtde_control import RTDEControlInterface
@@ -305,7 +327,8 @@ class _Stream:
         if not self._config.dry_run:
             self._control = RTDEControlInterface(host)
             self._control.setWatchdog(_WATCHDOG_FREQUENCY)
-            self._period = self._control.getStepTime()
+            # 0 from a CB3, to which ur_rtde does not send that question.
+            self._period = self._control.getStepTime() or _CB3_PERIOD
 
     def _check_robot(self, age: float) -> Fault:
         """What the robot says of itself, or that it says nothing."""
@@ -390,7 +413,11 @@ class _Stream:
         return Fault.NONE if taken else Fault.NOT_RUNNING
 
     def _brake(self) -> None:
-        """Stops the arm and ends the program that could move it."""
+        """Stops the arm and ends the program that could move it.
+
+        Where the robot is not well it stops by itself: by what it does then, or by its
+        watchdog, since nothing is sent any more.  The library would wait in vain.
+        """
         if self._control is None:
             return
         try:

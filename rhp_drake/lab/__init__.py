@@ -1,0 +1,1 @@
+"""A virtual lab: stand-ins for the machines of a real one, on loopback."""
