@@ -5,7 +5,7 @@ out has the default that `station.hardware_station.HardwareConfig` gives it.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from rhp_drake import typed_yaml
@@ -46,7 +46,7 @@ def running_hardware(config: HardwareConfig, num_objects: int) -> Iterator[Hardw
         num_objects: m; the tracker must know as many.
 
     Raises:
-        InputError: If the robot does not answer, or the tracker lacks an object.
+        InputError: If the robot cannot be used, or the tracker lacks an object.
         WorkError: If the tracker does not answer.
     """
     if len(config.natnet.bodies) != num_objects:
@@ -56,10 +56,10 @@ def running_hardware(config: HardwareConfig, num_objects: int) -> Iterator[Hardw
         )
     tracker = NatNetDriver(config.natnet)
     arm = UrDriver(config.ur, COMMAND_PERIOD)
-    try:
+    with ExitStack() as stack:
+        # The arm first, and each even if the other's fails.
+        stack.callback(tracker.stop)
+        stack.callback(arm.stop)
         tracker.start()
         arm.start()
         yield Hardware(arm, tracker)
-    finally:
-        arm.stop()
-        tracker.stop()

@@ -118,10 +118,16 @@ def run_on_hardware(
     goals[0] = goal
     _set_goals(simulator, goals)
 
+    ticks = 0
+
     def advance(until: float) -> None:
-        while until - context.get_time() > COMMAND_PERIOD / 2:
+        nonlocal ticks
+        while context.get_time() < until:
             begin = time.monotonic()
-            next_time = min(context.get_time() + COMMAND_PERIOD, until)
+            # Half-way between two commands, so that each stretch has exactly one: the
+            # planner's period is no multiple of theirs.
+            ticks += 1
+            next_time = (ticks - 0.5) * COMMAND_PERIOD
             simulator.AdvanceTo(next_time, interruptible=False)
             time.sleep(max(0.0, begin + COMMAND_PERIOD - time.monotonic()))
 
@@ -138,7 +144,7 @@ def _run(
 
     Args:
         simulator: Of the closed loop.
-        advance: Advances it to a time.
+        advance: Advances it to a time, or a little further.
         time_limit: See `run_closed_loop`.
         on_decision: Likewise.
     """

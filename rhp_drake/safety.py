@@ -45,7 +45,8 @@ _SENTENCES: Final = {
     Fault.STALE_MEASUREMENT: "the arm has not been heard of for too long.",
     Fault.STALE_COMMAND: "no command came in time.",
     Fault.PROTECTIVE_STOP: "the robot is in a protective stop.",
-    Fault.EMERGENCY_STOP: "the robot's emergency stop is pressed.",
+    Fault.EMERGENCY_STOP: "the robot's emergency or safeguard stop is on, or a safety "
+    "fault.",
     Fault.NOT_RUNNING: "the robot is off, or its program does not run.",
     Fault.CONNECTION_LOST: "the connection to the robot is lost.",
 }
@@ -75,13 +76,14 @@ class JointLimits:
     tracking_limit: float = 0.2
 
     def validate(self) -> None:
-        """Raises an InputError unless there are six position limits, all positive."""
+        """Raises an InputError if a limit is impossible, or no limit at all."""
         limits = [*self.position_limits, self.velocity_limit, self.tracking_limit]
-        # Written so that nan is refused, too.
-        if len(self.position_limits) != _NUM_JOINTS or not all(x > 0 for x in limits):
+        # Written so that nan is refused, too; and infinity, which limits nothing.
+        possible = all(0 < limit < math.inf for limit in limits)
+        if len(self.position_limits) != _NUM_JOINTS or not possible:
             raise InputError(
-                f"the joint limits need {_NUM_JOINTS} position limits, and all "
-                f"positive; they are {self}."
+                f"the joint limits need {_NUM_JOINTS} position limits, and all finite "
+                f"and positive; they are {self}."
             )
 
 

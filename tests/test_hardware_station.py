@@ -150,6 +150,17 @@ def test_the_loop_moves_the_arm_and_takes_its_goals_from_what_it_sees(
     assert np.abs(steps).max() / COMMAND_PERIOD < 1.0
 
 
+def test_each_period_has_one_command(hardware, monkeypatch):
+    counts = []
+    monkeypatch.setattr(
+        "time.sleep", lambda seconds: counts.append(len(hardware.arm.commands))
+    )
+    simulator = Simulator(MakeClosedLoop(Scenario(), Forward(), hardware=hardware))
+    run_on_hardware(simulator, np.array([0.7, 0.25]), seed=0, time_limit=1.0)
+    assert counts == list(range(1, len(counts) + 1))
+    assert len(counts) == pytest.approx(1.0 / COMMAND_PERIOD, abs=1)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -18,7 +18,8 @@ def calibrate(
     """Fits natnet.X_WO of a hardware file, and says how well it fits.
 
     Put a marker on the hand, stop at several places over the table, and note for each
-    what Motive says of the marker and what the robot says of the hand.
+    where Motive and where the robot says that the marker is. W is the robot's
+    base_link: where PolyScope's Base has x and y, it has -x and -y.
     """
     import numpy as np
     from pydrake.math import RollPitchYaw

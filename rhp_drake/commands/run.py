@@ -122,6 +122,8 @@ def _run(
     meshcat = task_run.start_meshcat(scenario) if use_meshcat else None
     console = task_run.make_console()
     with ExitStack() as stack:
+        # Written last, once the arm has been stopped: that takes its time.
+        stack.enter_context(task_run.recorded(meshcat, folder))
         running = None
         if config is not None:
             console.print(f"Connecting to {config.description or hardware_file}")
@@ -132,7 +134,6 @@ def _run(
         )
         make_folder(folder)
         task_run.say_title(console, title, scenario, meshcat)
-        stack.enter_context(task_run.recorded(meshcat, folder))
         run = task_run.run_task(
             simulator, scenario, console, on_hardware=running is not None
         )

@@ -88,7 +88,9 @@ FAULTS: Final = {
         "ends a protective stop, after 5 s",
         lambda lab: lab.controller.unlock_protective_stop(),
     ),
-    "restart": LabFault((), "releases all stops, and powers on", _restart_robot),
+    "restart": LabFault(
+        (), "releases all but a protective stop, and powers on", _restart_robot
+    ),
     "reboot": LabFault((), "the robot's controller starts anew", _reboot),
     "drop_connection": LabFault(
         (), "the robot's connections break", lambda lab: lab.rtde.drop_connections()
@@ -142,7 +144,7 @@ FAULTS: Final = {
         "the cameras take one for the other",
         lambda lab, first, second: lab.natnet.swap(first, second),
     ),
-    "clear": LabFault((), "streams are well again", _clear),
+    "clear": LabFault((), "streams are well again, but for what is swapped", _clear),
 }
 
 
