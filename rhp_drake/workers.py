@@ -54,20 +54,27 @@ def _use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _start_worker() -> None:
-    """Makes a new process a worker, which does not outlive the one it works for."""
-    _use_one_thread()
+def follow_parent() -> None:
+    """Makes this process end when its parent does, and not by Ctrl-C.
+
+    Else a process whose parent was killed waits for work for ever.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def follow() -> None:
-        # Else a worker whose parent was killed waits for work for ever.
         wait([parent.sentinel])
         os._exit(1)
 
     Thread(target=follow, daemon=True).start()
     # Ctrl-C reaches the whole group: the parent decides what comes of it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _start_worker() -> None:
+    """Makes a new process a worker, which does not outlive the one it works for."""
+    _use_one_thread()
+    follow_parent()
 
 
 def run_over(

@@ -101,7 +101,7 @@ def test_evaluate_writes_every_episode_and_report_a_page(monkeypatch, capsys, tm
     save_q_network(PaperQNetwork(3), weights)
     options = [
         "--policies=gp,rhp33",
-        "--levels=none,none",
+        "--levels=none, none",
         "--instances=2",
         "--workers=1",
         f"--out={out}",

@@ -129,6 +129,11 @@ def test_numbers_of_objects_in_turn(tmp_path):
         assert episode.outcome in ("succeeded", "out of actions", "object fell")
 
 
+def test_weights_for_other_objects_are_found_before_the_work_begins():
+    with pytest.raises(InputError, match="the weights are for 3 objects, not 5"):
+        experiment(["kdp", "gp"], ["imitation"], num_objects=5)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -136,6 +141,7 @@ def test_numbers_of_objects_in_turn(tmp_path):
         ({"num_objects": 5, "world": "station"}, "the station has 3 objects, not 5"),
         ({"world": "moon"}, "'moon' is not a world: planar, station, or package"),
         ({"world": "moon:make"}, "the world moon:make: cannot be imported"),
+        ({"world": ".math:make"}, "the world .math:make: cannot be imported"),
         ({"world": "math:make"}, "the module math has no function 'make'"),
         ({"num_instances": 501}, "501 instances were asked for; the validation set"),
         ({"instances": "exam"}, "'exam' is not a set of instances"),

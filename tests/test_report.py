@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 from small_experiment import experiment
 
+from rhp_drake.evaluation import report as report_module
 from rhp_drake.evaluation import results as module
 from rhp_drake.evaluation.cells import Cell, compare, group, paper_cell
 from rhp_drake.evaluation.episode import Episode
 from rhp_drake.evaluation.experiment import Column, Trial
 from rhp_drake.evaluation.figure4_data import Point, PointResult, write_results
 from rhp_drake.evaluation.paper_results import TABLE1
+from rhp_drake.evaluation.plots import to_svg
 from rhp_drake.evaluation.report import write_report
+from rhp_drake.evaluation.result_plots import draw_success, draw_success_by_time
 from rhp_drake.evaluation.results import run_experiment
+from rhp_drake.evaluation.statistics import grouped_wilson_interval, wilson_interval
 from rhp_drake.frozen_instances import load_instances
 from rhp_drake.physics import UNCERTAINTY_LEVELS
 from rhp_drake.random_streams import VALIDATION
@@ -33,7 +37,7 @@ def episode(succeeded, index=0, seconds=0.25):
     )
 
 
-def cell(successes, column="gp best", trials=2):
+def cell(successes, column="gp best", trials=1):
     policy, weights = column.split()
     return Cell(
         [
@@ -66,18 +70,46 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_a_cell_adds_up():
-    # Instances 0 to 24, two trials each; the first batch is 20 instances.
     ours = cell([True] * 30 + [False] * 20)
     assert (ours.successes, ours.trials, ours.percent) == (30, 50, 60.0)
     assert ours.rate == "60.0 (46.2-72.4)"
     assert ours.wilson == pytest.approx((46.2, 72.4), abs=0.05)
-    # Batches of 75 % and 0 %: mean 37.5, Student's t with one degree of freedom.
-    assert ours.plus_minus == pytest.approx(12.706 * 75 / 2, rel=1e-3)
+    # Whole batches of 100 % and 50 %: Student's t with one degree of freedom.
+    assert ours.plus_minus == pytest.approx(12.706 * 50 / 2, rel=1e-3)
     assert ours.seconds == pytest.approx(1.5)
     assert ours.mean_decision_milliseconds == pytest.approx(250.0)
     assert ours.causes == {"out of actions": 20}
     assert np.isnan(cell([False]).seconds)
-    assert np.isnan(cell([True]).plus_minus)
+    assert np.isnan(cell([True] * 39).plus_minus)
+
+
+def test_a_trial_repeated_is_no_more_evidence():
+    """A greedy policy does the same in each, where physics are certain."""
+    once, other = [True, False] * 10, [True, True, True, False] * 5
+    often, others = (np.repeat(of, 10).tolist() for of in (once, other))
+    assert cell(often, trials=10).wilson == pytest.approx(cell(once).wilson)
+    assert cell([True] * 200, trials=10).rate == cell([True] * 20).rate
+    pair = compare(cell(often, trials=10), cell(others, trials=10))
+    assert pair == compare(cell(once), cell(other)) == (0, 5, 0.0625)
+    # One more of three is enough to win an instance.
+    first, second = (
+        cell([True, False, False] * 3, trials=3),
+        cell([False] * 9, trials=3),
+    )
+    assert compare(first, second) == (3, 0, 0.25)
+
+
+def test_independent_trials_count_in_full():
+    fives = np.full(20, 5), np.full(20, 10)
+    assert grouped_wilson_interval(*fives) == wilson_interval(100, 200)
+    successes = np.random.default_rng(0).binomial(10, 0.8, 500)
+    low, high = grouped_wilson_interval(successes, np.full(500, 10))
+    assert high - low == pytest.approx(2 * 1.96 * np.sqrt(0.8 * 0.2 / 5000), rel=0.1)
+    # A single instance says next to nothing.
+    for number in (0, 7, 10):
+        low, high = grouped_wilson_interval(np.array([number]), np.array([10]))
+        assert 0 <= low <= number / 10 <= high <= 1
+        assert high - low > 0.7
 
 
 def test_pairs_are_compared_in_the_trials_that_both_had():
@@ -115,6 +147,7 @@ def test_the_report_says_what_was_counted(folder):
         assert f"{ours.percent:.1f}" in text
         assert f"{ours.percent - 90.1:+.1f}" in text
         assert "nan" not in text
+        assert "go alike" in text
     (row,) = [
         line
         for line in markdown.split("### high")[1].splitlines()
@@ -143,6 +176,79 @@ def test_failures_of_the_best_policy_are_recorded(folder):
         assert path.name.startswith("rhp66_best_none_")
         assert f'href="recordings/{path.name}"' in report.page.read_text()
         assert f"(recordings/{path.name})" in report.markdown.read_text()
+
+
+def test_a_policy_without_failures_has_nothing_to_record(folder, monkeypatch):
+    """Others have."""
+    results = module.read_results(folder)
+    results.episodes[:] = [
+        (trial, episode(trial.column.policy == "rhp66" or trial.index > 0))
+        for trial, _ in results.episodes
+    ]
+    monkeypatch.setattr(report_module, "read_results", lambda folder: results)
+    write_report(folder, num_recordings=1)
+    (path,) = (folder / "recordings").iterdir()
+    assert path.name == "random_none_0_0.html"
+
+
+def texts(report) -> list[str]:
+    """Page and Markdown, whatever their lines."""
+    return [" ".join(p.read_text().split()) for p in (report.page, report.markdown)]
+
+
+def test_work_that_is_going_on_can_be_looked_at(folder):
+    """Levels, policies and instances may be missing yet."""
+    for text in texts(write_report(folder, 0)):
+        assert "3 policies on 22 instances" in text
+        assert "run alike" not in text
+    for path in (folder / "episodes").iterdir():
+        if "high" in path.name or path.name.startswith("gp_best_none_01_020"):
+            path.unlink()
+    page, markdown = texts(write_report(folder, 0))
+    for text in (page, markdown):
+        assert "3 policies on up to 22 instances" in text
+        assert "Not all policies have been run alike" in text
+    assert "### high" not in markdown
+    assert ">high<" not in page
+    for path in (folder / "episodes").iterdir():
+        if not path.name.startswith("rhp66_best_none_00_000"):
+            path.unlink()
+    for text in texts(write_report(folder, 0)):
+        assert "1 policy on 20 instances" in text
+        assert "Pairs of policies" not in text
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_policy_that_fails_at_once_decides_nothing():
+    none = Episode("policy failed", [], np.zeros((1, 12)))
+    column = Column("kdp", "")
+    cells = group([(Trial(column, "none", i, 0), none) for i in range(3)])
+    of = cells[column]["none"]
+    assert of.rate == "0.0 (0.0-56.1)"
+    assert np.isnan(of.mean_decision_milliseconds)
+    assert np.isnan(of.decision_milliseconds(95))
+    for figure in (draw_success(cells, with_paper=True), draw_success_by_time(cells)):
+        to_svg(figure)
+
+
+def legend(figure) -> list[str]:
+    """What the picture's legend says."""
+    (of_figure,) = figure.legends
+    return [text.get_text() for text in of_figure.get_texts()]
+
+
+def test_all_policies_are_in_the_legend_whatever_level_they_were_run_at():
+    columns = {Column("gp", "best"): "none", Column("rhp66", "paper"): "high"}
+    cells = group(
+        [
+            (Trial(column, level, 0, 0), episode(True))
+            for column, level in columns.items()
+        ]
+    )
+    assert legend(draw_success_by_time(cells)) == ["gp best", "rhp66 paper"]
+    # The paper has three objects; beside others its numbers would mislead.
+    assert legend(draw_success(cells, with_paper=False)) == ["best", "paper"]
+    assert "the paper, imitation" in legend(draw_success(cells, with_paper=True))
 
 
 def test_figure4_is_part_of_it_if_it_is_there(folder):

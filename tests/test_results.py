@@ -1,6 +1,7 @@
 """Folders of results: resumed exactly, and nobody else's is touched."""
 
 import json
+import shutil
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -12,6 +13,7 @@ from rhp_drake.evaluation import experiment as experiments
 from rhp_drake.evaluation import results as module
 from rhp_drake.evaluation.results import read_results, run_experiment
 from rhp_drake.files import exclusive
+from rhp_drake.resources import models_path
 from rhp_drake.workers import RayCluster
 
 CHANGING = ["decision_seconds", "world_seconds"]
@@ -113,8 +115,18 @@ def test_other_weights_of_the_same_name_are_refused(tmp_path):
     (config,) = other.columns.values()
     disguised = experiment(num_instances=1)
     disguised.columns.update(dict.fromkeys(disguised.columns, config))
-    with pytest.raises(InputError, match="holds results of another policy 'gp best'"):
+    message = r"of another policy 'gp best' \(q_network_sha256 '\w+', not '\w+'\); "
+    with pytest.raises(InputError, match=message):
         run(out, disguised)
+
+
+def test_policies_whose_files_would_have_the_same_name_are_refused(tmp_path):
+    weights = tmp_path / "rescue_best.safetensors"
+    shutil.copy(models_path() / "q_network/best.safetensors", weights)
+    out = tmp_path / "out"
+    run(out, experiment(["gp_rescue"], num_instances=1))
+    with pytest.raises(InputError, match="files of the name 'gp_rescue_best'; rename"):
+        run(out, experiment(["gp"], [str(weights)], num_instances=1))
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
@@ -135,6 +147,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
         (lambda text: json.dumps(["a list"]), "not readable settings"),
         (lambda text: text.replace("results 1", "results 9"), "has the format"),
         (lambda text: text.replace('"seed"', '"sed"'), "lacks 'seed'"),
+        (lambda text: text.replace('"policy"', '"p"'), "a column lacks 'policy'"),
     ],
 )
 def test_damaged_settings(damage, message, tmp_path):
@@ -158,6 +171,22 @@ def test_damaged_episodes(tmp_path):
         with pytest.raises(InputError, match=f"{path.name}: not a readable file"):
             read()
     assert path.read_bytes() == content
+
+
+def test_files_that_do_not_belong_there(tmp_path):
+    out, other = tmp_path / "out", tmp_path / "other"
+    run(out, work(num_instances=2, levels=["none"]))
+    run(other, work(num_instances=2, levels=["low"]))
+    copy = out / "episodes/gp_best_none_00_000 (copy).parquet"
+    shutil.copy(out / "episodes/gp_best_none_00_000.parquet", copy)
+    with pytest.raises(InputError, match="holds episodes that another file has, too"):
+        read_results(out)
+    shutil.copy(other / "episodes/gp_best_low_00_000.parquet", copy)
+    with pytest.raises(InputError, match=r"of gp best \(low\), which settings\.json"):
+        read_results(out)
+    pq.write_table(pq.read_table(copy).drop_columns("outcome"), copy)
+    with pytest.raises(InputError, match=r"copy.*: lacks the column 'outcome'"):
+        read_results(out)
 
 
 def test_one_process_a_folder(tmp_path):

@@ -89,6 +89,13 @@ def test_cells():
     assert lines[-len(POLICIES)].split() == ["kdp", *"111111"]
 
 
+def test_nothing_is_said_of_runs_that_were_not():
+    none = Episode("policy failed", [], np.zeros((1, 12)))
+    cells = group([(Trial(Column("kdp", ""), "none", 0, 0), none)])
+    (row,) = printed(make_success_table(cells, "title"))[-1:]
+    assert row.split() == ["kdp", "0.0", "(0.0-79.3)", "98.0"]
+
+
 def test_no_paper_beside_other_numbers_of_objects():
     lines = printed(make_success_table(cells_of(["high"], 0.0), "title", 5))
     assert "15.7" not in lines[-len(POLICIES)]

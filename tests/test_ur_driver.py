@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from robot_process import START, running_robot, wait_until
 
-from rhp_drake.drivers import ur_driver
+from rhp_drake.drivers import ur_stream
 from rhp_drake.drivers.shared_memory import SharedVector
-from rhp_drake.drivers.ur_driver import UrDriver, UrDriverConfig
+from rhp_drake.drivers.ur_config import UrDriverConfig
+from rhp_drake.drivers.ur_driver import UrDriver
 from rhp_drake.errors import InputError
 from rhp_drake.lab.modes import RobotMode, RuntimeState, SafetyMode
 from rhp_drake.lab.rtde_server import Stream
@@ -317,11 +318,11 @@ class Cycles:
     """The driver's cycles, one at a time, at times that a test chooses."""
 
     def __init__(self, robot, **changes):
-        self.stream = ur_driver._Stream(
+        self.stream = ur_stream.Stream(
             UrDriverConfig(host=HOST, **changes),
             COMMAND_PERIOD,
-            SharedVector(ur_driver._COMMAND_SIZE),
-            SharedVector(ur_driver._MEASUREMENT_SIZE),
+            SharedVector(ur_stream.COMMAND_SIZE),
+            SharedVector(ur_stream.MEASUREMENT_SIZE),
         )
         self.stream._control = self.stream._receive = robot
         self.stream._connect = lambda: None
@@ -402,7 +403,7 @@ def test_a_call_that_takes_longer_than_the_watchdog_is_a_lost_connection():
 
 
 def test_a_call_that_does_not_return_is_noticed(monkeypatch):
-    monkeypatch.setattr(ur_driver, "_STUCK_TIME", 0.05)
+    monkeypatch.setattr(ur_stream, "_STUCK_TIME", 0.05)
     dut = Cycles(Robot(slow=0.5))
     thread = Thread(target=dut.stream.run, args=(lambda: False, pytest.fail))
     thread.start()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rhp_drake.errors import InputError
+from rhp_drake.errors import InputError, WorkError
 from rhp_drake.evaluation.episode import TIME_LIMIT, run_episode, run_episodes
 from rhp_drake.evaluation.experiment import Experiment, make_columns, run_batch
 from rhp_drake.evaluation.world import PlanarWorld, WorldError, load_world_factory
@@ -96,6 +96,13 @@ def test_a_world_may_fail(after):
 def test_a_world_of_another_shape_is_refused():
     with pytest.raises(InputError, match=r"Strange shows a state of shape \(3,\)"):
         run_episode(Strange(np.zeros(3)), Turning(), INSTANCE, 0)
+
+
+def test_a_world_that_cannot_begin_says_nothing_of_the_policy():
+    world = Strange(None)
+    world.reset = lambda: setattr(world, "state", np.full(12, np.nan))
+    with pytest.raises(WorkError, match="Strange cannot be reset: the state is not f"):
+        run_episode(world, Turning(), INSTANCE, 0)
 
 
 def test_computation_has_a_limit(monkeypatch):

@@ -143,7 +143,7 @@ def evaluate(
 
 def _names(text: str) -> list[str]:
     """The names in a list, each once."""
-    return list(dict.fromkeys(text.split(",")))
+    return list(dict.fromkeys(name.strip() for name in text.split(",")))
 
 
 def _run(
@@ -187,8 +187,9 @@ def _print_results(experiment: "Experiment", folder: Path, console: "Console") -
     title = f"{experiment.world} world, {experiment.instances} set"
     if experiment.num_objects != NUM_OBJECTS:
         title += f", {experiment.num_objects} objects"
-    if len(experiment.levels) == 1:
-        title += f", uncertainty: {experiment.levels[0]}"
+    levels = {level for by_level in cells.values() for level in by_level}
+    if len(levels) == 1:
+        title += f", uncertainty: {min(levels)}"
     tables = [make_success_table(cells, title, experiment.num_objects)]
     if any(cell.causes for by_level in cells.values() for cell in by_level.values()):
         tables.append(make_failure_table(cells))

@@ -1,5 +1,6 @@
 """`rhp report`: what a folder of results comes to."""
 
+import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +13,7 @@ def report(
     recordings: Annotated[
         int,
         typer.Option(
-            min=0, help="Record so many failures of the most successful policy."
+            min=0, help="Record so many failures of the most successful policies."
         ),
     ] = 4,
 ) -> None:
@@ -25,6 +26,8 @@ def report(
 
     from rhp_drake.evaluation.report import write_report
 
+    # Where Meshcat listens is nothing to a recording.
+    logging.getLogger("drake").setLevel(logging.WARNING)
     written = write_report(folder, recordings)
     Console(highlight=False, soft_wrap=True).print(
         f"{written.page} (open it in a browser), {written.markdown}"

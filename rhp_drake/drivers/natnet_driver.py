@@ -5,11 +5,9 @@ from dataclasses import dataclass, field
 import importlib.util
 import math
 import multiprocessing
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 import os
-import signal
-from threading import Thread
 import time
 from typing import TYPE_CHECKING, Any, Final
 import weakref
@@ -18,6 +16,7 @@ import numpy as np
 
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.errors import InputError, WorkError
+from rhp_drake.workers import follow_parent
 
 if TYPE_CHECKING:
     from pydrake.math import RigidTransform
@@ -261,20 +260,6 @@ def _kill(process: BaseProcess) -> None:
     process.join()
 
 
-def _follow_parent() -> None:
-    """Makes this process end when its parent does, and not by Ctrl-C."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    Thread(target=follow, daemon=True).start()
-    # Ctrl-C reaches the whole group: the parent decides what comes of it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def _make_natnet_doubt_counts() -> None:
     """Makes natnet raise an error where a datagram counts more than it contains.
 
@@ -298,7 +283,7 @@ def _make_natnet_doubt_counts() -> None:
 
 def _receive(config: NatNetConfig, vector: SharedVector, answer: Connection) -> None:
     """What the driver's process does, until it is killed."""
-    _follow_parent()
+    follow_parent()
     _make_natnet_doubt_counts()
     # natnet prints a line for each odd datagram.
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):

@@ -1,124 +1,32 @@
 """A UR robot over RTDE, in a process of its own: a long plan never starves its stream.
 
-The process takes the newest command from shared memory and sends it, by `servoJ`, at
-the controller's own rate (125 Hz on a CB3, 500 Hz on an e-Series); it writes what the
-robot measures to shared memory.  Nobody else touches a socket.
-
-It trusts nobody: it checks every command, and stops the arm when a check fails, when
-commands cease to come while the arm moves, when the robot leaves normal operation or
-the connection is lost.  Then the fault is latched, and the arm stays stopped until a
-new driver is started.  If this process itself dies, the controller's watchdog stops
-the arm.  Until it is engaged no motion is asked for at all.
+`ur_stream` is what that process does.  Nobody else touches a socket: commands and
+measurements go through shared memory.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-import math
+from dataclasses import dataclass
 import multiprocessing
-from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event
-import os
-import signal
-from threading import Thread
 import time
-import traceback
-from typing import Any, Final
+from typing import Final
 import weakref
 
 import numpy as np
 
 from rhp_drake.drivers.shared_memory import SharedVector
+from rhp_drake.drivers.ur_config import UrDriverConfig
+from rhp_drake.drivers.ur_stream import (
+    COMMAND_SIZE,
+    MEASUREMENT_SIZE,
+    NUM_JOINTS,
+    serve,
+)
 from rhp_drake.errors import InputError
-from rhp_drake.safety import Fault, JointLimits, check_command
+from rhp_drake.safety import Fault
 
-NUM_JOINTS: Final = 6
-
-# ur_rtde ignores speed and acceleration of servoJ, but checks their ranges.
-_UNUSED: Final = 0.5
-# m/s^2 of the tool, since servoStop ends in stopl; ur_rtde's own is 10.
-_DECELERATION: Final = 8.0
-# Hz: the controller stops by itself when it hears less often from us.
-_WATCHDOG_FREQUENCY: Final = 10.0
-_CB3_PERIOD: Final = 0.008  # s
-_E_SERIES_PERIOD: Final = 0.002  # s
 # How long `stop` waits for the arm to brake.
 _STOP_TIME: Final = 2.0  # s
-# A call of the library that takes so long tries to connect anew, for ever.
-_STUCK_TIME: Final = 1.0  # s
-_WATCH_PERIOD: Final = 0.1  # s
-# RTDE guide of Universal Robots: robot and safety modes, and a program that runs.
-_ROBOT_RUNNING: Final = 7
-_SAFETY_NORMAL: Final = (1, 2)  # Normal, reduced.
-_SAFETY_PROTECTIVE: Final = (3, 4)  # Protective stop, recovery.
-_PROGRAM_RUNNING: Final = 2
-_VARIABLES: Final = [
-    "timestamp",
-    "actual_q",
-    "actual_qd",
-    "robot_mode",
-    "safety_mode",
-    "runtime_state",
-]
-# Faults in which the robot is well and waits for what it is told.
-_OURS: Final = (
-    Fault.NOT_FINITE,
-    Fault.POSITION_LIMIT,
-    Fault.VELOCITY_LIMIT,
-    Fault.TRACKING_ERROR,
-    Fault.STALE_COMMAND,
-)
-
-# Layout of the shared vectors.
-_COMMAND_SIZE: Final = 1 + NUM_JOINTS  # Whether engaged, positions.
-# q, qd, when they came (time.monotonic), fault, cycles, longest cycle.
-_MEASUREMENT_SIZE: Final = 2 * NUM_JOINTS + 4
-
-
-@dataclass
-class UrDriverConfig:
-    """How to reach the robot, and what it may be told.
-
-    Attributes:
-        host: Its address.
-        lookahead_time: Of servoJ, 0.03 to 0.2 s: more is smoother and later.
-        gain: Of servoJ, 100 to 2000: more follows closer.
-        limits: On commands.
-        command_timeout: How long the arm may move without a new command, s, and the
-            robot be silent.
-        patience: How long it may stand still without one, s: a policy thinks while the
-            hand rests.
-        connection_timeout: How long the robot may take to answer at first, s.
-        dry_run: Whether everything is done but moving the arm; it is then said to be
-            where it was commanded to be.
-    """
-
-    host: str = ""
-    lookahead_time: float = 0.1
-    gain: float = 300.0
-    limits: JointLimits = field(default_factory=JointLimits)
-    command_timeout: float = 0.06
-    patience: float = 5.0
-    connection_timeout: float = 10.0
-    dry_run: bool = False
-
-    def validate(self) -> None:
-        """Raises an InputError that names the first impossible value."""
-        if not self.host:
-            raise InputError("ur.host: the robot's address is missing.")
-        self.limits.validate()
-        for name, low, high in (
-            ("lookahead_time", 0.03, 0.2),
-            ("gain", 100.0, 2000.0),
-            ("command_timeout", 0.01, 1.0),
-            ("patience", 0.01, 600.0),
-            ("connection_timeout", 0.1, 600.0),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(
-                    f"ur.{name} is {value}; it must be from {low:g} to {high:g}."
-                )
 
 
 @dataclass(frozen=True)
@@ -163,14 +71,14 @@ class UrDriver:
                 'pip install -c constraints.txt -e ".[hardware]".'
             ) from None
         self._config = config
-        self._commands = SharedVector(_COMMAND_SIZE)
-        self._measurements = SharedVector(_MEASUREMENT_SIZE)
+        self._commands = SharedVector(COMMAND_SIZE)
+        self._measurements = SharedVector(MEASUREMENT_SIZE)
         context = multiprocessing.get_context("spawn")
         self._stopping = context.Event()
         self._problem, self._sender = context.Pipe(duplex=False)
         self._end: weakref.finalize | None = None
         self._process = context.Process(
-            target=_serve,
+            target=serve,
             args=(
                 config,
                 command_period,
@@ -256,282 +164,3 @@ def _end(process: BaseProcess, stopping: Event) -> None:
         # The watchdog stops the arm.
         process.kill()
         process.join()
-
-
-def _serve(
-    config: UrDriverConfig,
-    command_period: float,
-    commands: SharedVector,
-    measurements: SharedVector,
-    stopping: Event,
-    problem: Connection,
-) -> None:
-    """The driver's process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    stream = _Stream(config, command_period, commands, measurements)
-
-    def watch() -> None:
-        while not wait([parent.sentinel], timeout=_WATCH_PERIOD):
-            if stream.is_stuck:
-                # Before the library uploads its program anew, without a watchdog.
-                os._exit(1)
-        stopping.set()
-
-    Thread(target=watch, daemon=True).start()
-    try:
-        stream.run(stopping.is_set, problem.send)
-    except Exception:
-        # Nothing is sent any more, so that the watchdog stops the arm.
-        traceback.print_exc()
-    finally:
-        # The library's threads may hang on a dead connection.
-        os._exit(0)
-
-
-class _Stream:
-    """The driver's loop: measure, check, command."""
-
-    def __init__(
-        self,
-        config: UrDriverConfig,
-        command_period: float,
-        commands: SharedVector,
-        measurements: SharedVector,
-    ) -> None:
-        self._config = config
-        self._command_period = command_period
-        self._commands = commands
-        self._measurements = measurements
-        self._fault = Fault.NONE
-        self._receive: Any = None
-        self._control: Any = None
-        self._period = command_period
-        # The newest command that was accepted, shape (6,), and whether it differs from
-        # the one before; when it was, and when it was written; what had been sent by
-        # then, shape (6,).  None until the arm is engaged.
-        self._accepted: np.ndarray | None = None
-        self._moving = False
-        self._accepted_at = np.nan
-        self._stamp = np.nan
-        self._before: np.ndarray | None = None
-        # What was sent last, shape (6,).
-        self._sent: np.ndarray | None = None
-        # Whether the robot did not take what was sent last.
-        self._refused = False
-        # How much later than due the newest command may have come, s.
-        self._slack = command_period
-        self._cycles = 0
-        self._longest_cycle = 0.0
-        self._sent_at = np.nan
-        # When the call of the library began that has not returned, s; else inf.
-        self._calling_since = np.inf
-
-    @property
-    def is_stuck(self) -> bool:
-        """Whether the library does not return; may be asked from any thread."""
-        return time.monotonic() - self._calling_since > _STUCK_TIME
-
-    def run(
-        self, stopping: Callable[[], bool], tell_problem: Callable[[str], None]
-    ) -> None:
-        """Until told to stop; the first measurement tells that it is connected.
-
-        Args:
-            stopping: Whether to stop.
-            tell_problem: Called, once, if there is no connection.
-        """
-        try:
-            self._connect()
-        except (RuntimeError, ValueError) as error:
-            tell_problem(str(error))
-            return
-        timestamp, heard_at = np.nan, time.monotonic()
-        cycle = time.monotonic()
-        position = velocity = np.full(NUM_JOINTS, np.nan)
-        while not stopping():
-            now = time.monotonic()
-            fault = Fault.NONE
-            try:
-                if self._receive.getTimestamp() != timestamp:
-                    timestamp, heard_at = self._receive.getTimestamp(), now
-                position = np.array(self._receive.getActualQ())
-                velocity = np.array(self._receive.getActualQd())
-                fault = self._check_robot(now - heard_at)
-                if fault == self._fault == Fault.NONE:
-                    self._calling_since = now
-                    fault = self._follow(position, now)
-                    passed = self._receive.getTimestamp() - timestamp
-                    if fault == Fault.NONE and passed > 1 / _WATCHDOG_FREQUENCY:
-                        # By now the watchdog has ended the program.  If it runs all
-                        # the same the library has connected anew meanwhile, and its
-                        # new program has no watchdog.
-                        fault = Fault.CONNECTION_LOST
-            except (RuntimeError, ValueError):
-                # What the library throws when it has lost the robot.
-                fault = Fault.CONNECTION_LOST
-            self._calling_since = np.inf
-            new_fault = fault != self._fault == Fault.NONE
-            if new_fault:
-                self._fault = fault
-            if self._config.dry_run and self._accepted is not None:
-                position = self._accepted
-            # A frozen stream looks old, whatever is read from it.
-            rest = [heard_at, self._fault, self._cycles, self._longest_cycle]
-            self._measurements.write(np.concatenate([position, velocity, rest]))
-            # After it was told: to stop takes a while.
-            if new_fault:
-                self._stop_arm()
-            if self._fault == Fault.CONNECTION_LOST:
-                # The library would connect anew and upload its program again and again.
-                return
-            # Late once, it is not early afterwards.
-            cycle = max(cycle + self._period, time.monotonic())
-            time.sleep(max(0.0, cycle - time.monotonic()))
-        if self._fault == Fault.NONE:
-            self._stop_arm()
-
-    def _connect(self) -> None:
-        from rtde_control import RTDEControlInterface
-        from rtde_receive import RTDEReceiveInterface
-
-        host = self._config.host
-        self._receive = RTDEReceiveInterface(host, -1.0, _VARIABLES)
-        if not self._config.dry_run:
-            self._control = RTDEControlInterface(host)
-            # The answer is not waited for: the first time one reads what was in the
-            # robot's register before.  A CB3 never answers.
-            self._control.getStepTime()
-            time.sleep(2 * _CB3_PERIOD)
-            is_e_series = math.isclose(
-                self._control.getStepTime(), _E_SERIES_PERIOD, rel_tol=0.01
-            )
-            self._period = _E_SERIES_PERIOD if is_e_series else _CB3_PERIOD
-            if not self._control.setWatchdog(_WATCHDOG_FREQUENCY):
-                raise RuntimeError("it did not take the watchdog")
-
-    def _check_robot(self, age: float) -> Fault:
-        """What the robot says of itself, or that it says nothing."""
-        receive = self._receive
-        # The library has two connections; the control's it makes anew by itself.
-        control = self._control
-        if not (receive.isConnected() and (control is None or control.isConnected())):
-            return Fault.CONNECTION_LOST
-        if age > self._config.command_timeout:
-            return Fault.STALE_MEASUREMENT
-        safety = receive.getSafetyMode()
-        if safety in _SAFETY_PROTECTIVE:
-            return Fault.PROTECTIVE_STOP
-        if safety not in _SAFETY_NORMAL:
-            return Fault.EMERGENCY_STOP
-        program_runs = control is None or receive.getRuntimeState() == _PROGRAM_RUNNING
-        if receive.getRobotMode() != _ROBOT_RUNNING or not program_runs:
-            return Fault.NOT_RUNNING
-        return Fault.NONE
-
-    def _follow(self, measured: np.ndarray, now: float) -> Fault:
-        """Takes the newest command, if it is safe, and goes there."""
-        if self._refused:
-            # Only now: by its own stream the robot may have told a better reason.
-            return Fault.NOT_RUNNING
-        values, stamp = self._commands.read()
-        if np.isnan(stamp) or not values[0]:
-            # Not engaged, or no more: then the next command has to be where the arm is
-            # again.  The controller waits for a sign of life all the same.
-            self._accepted = self._sent = None
-            self._slack = self._command_period
-            if self._control is not None:
-                self._control.kickWatchdog()
-            return Fault.NONE
-        if stamp != self._stamp:
-            fault = self._accept(values[1:], measured, now)
-            if fault != Fault.NONE:
-                return fault
-            self._stamp = stamp
-        config = self._config
-        limit = config.command_timeout if self._moving else config.patience
-        if now - stamp > limit:
-            return Fault.STALE_COMMAND
-        return self._send(now)
-
-    def _accept(self, desired: np.ndarray, measured: np.ndarray, now: float) -> Fault:
-        """Checks a new command and makes it the one to follow."""
-        config, previous = self._config, self._accepted
-        # The first command has to be where the arm is.
-        accepted = measured if previous is None else previous
-        # After a long rest, too, the arm must not be sent far away at once.
-        elapsed = now - self._accepted_at if previous is not None else 0.0
-        # The commands' clock and this one may be a command apart, but no more: what a
-        # command takes beyond its time, the next ones lack.
-        allowed = min(elapsed, config.command_timeout) + self._slack
-        fault = check_command(
-            config.limits,
-            allowed,
-            desired,
-            accepted,
-            accepted if config.dry_run else measured,
-        )
-        if fault == Fault.NONE:
-            taken = np.abs(desired - accepted).max() / config.limits.velocity_limit
-            self._slack = min(allowed - taken, self._command_period)
-            self._moving = previous is not None and (desired != previous).any()
-            self._before = desired if self._sent is None else self._sent
-            self._accepted, self._accepted_at = desired, now
-        return fault
-
-    def _send(self, now: float) -> Fault:
-        """Sends where the arm is to be by now, on a straight line to the command.
-
-        What is sent never goes faster than the limit, also after commands that came
-        late or were missed.
-        """
-        assert self._accepted is not None
-        assert self._before is not None
-        if not np.isnan(self._sent_at):
-            self._longest_cycle = max(self._longest_cycle, now - self._sent_at)
-        self._sent_at = now
-        self._cycles += 1
-        # A controller that is faster than the commands gets several points of the line.
-        share = (now - self._accepted_at + self._period) / self._command_period
-        position = self._before + min(share, 1.0) * (self._accepted - self._before)
-        sent = position if self._sent is None else self._sent
-        step = position - sent
-        longest = self._config.limits.velocity_limit * self._period
-        self._sent = sent + step * min(1.0, longest / max(np.abs(step).max(), longest))
-        if self._control is None:
-            return Fault.NONE
-        self._refused = not self._control.servoJ(
-            self._sent.tolist(),
-            _UNUSED,
-            _UNUSED,
-            self._period,
-            self._config.lookahead_time,
-            self._config.gain,
-        )
-        return Fault.NONE
-
-    def _stop_arm(self) -> None:
-        """Stops the arm and ends the program that could move it.
-
-        Where the robot is not well it stops by itself: by what it does then, or by its
-        watchdog, since nothing is sent any more.  But its program may be paused, and
-        would go on to the last position once somebody resumes it.  The library would
-        wait for it in vain; the dashboard ends it.
-        """
-        if self._control is None:
-            return
-        try:
-            if self._fault == Fault.NONE or self._fault in _OURS:
-                self._control.servoStop(_DECELERATION)
-                self._control.stopScript()
-            else:
-                from dashboard_client import DashboardClient
-
-                dashboard = DashboardClient(self._config.host)
-                dashboard.connect()
-                dashboard.stop()
-        except RuntimeError:
-            # There is no connection left: the watchdog stops the arm.
-            pass

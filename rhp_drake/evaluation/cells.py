@@ -17,10 +17,9 @@ from rhp_drake.evaluation.paper_results import (
     PaperCell,
 )
 from rhp_drake.evaluation.statistics import (
-    format_rate,
+    grouped_wilson_interval,
     mcnemar,
     t_interval,
-    wilson_interval,
 )
 
 # How the Q-networks that come with the package learned.
@@ -58,29 +57,48 @@ class Cell:
         """Success, %."""
         return 100 * self.successes / self.trials
 
-    @property
+    @cached_property
+    def _by_instance(self) -> dict[int, list[bool]]:
+        """Which trials on each instance succeeded."""
+        instances: dict[int, list[bool]] = {}
+        for trial, episode in self.results:
+            instances.setdefault(trial.index, []).append(episode.succeeded)
+        return instances
+
+    @cached_property
     def wilson(self) -> tuple[float, float]:
-        """Wilson's 95 % interval, %."""
-        low, high = wilson_interval(self.successes, self.trials)
+        """Wilson's 95 % interval, %; trials on the same instance go alike."""
+        of_instances = self._by_instance.values()
+        low, high = grouped_wilson_interval(
+            np.array([sum(succeeded) for succeeded in of_instances]),
+            np.array([len(succeeded) for succeeded in of_instances]),
+        )
         return 100 * low, 100 * high
 
     @property
     def rate(self) -> str:
         """Success with Wilson's interval, for people."""
-        return format_rate(self.successes, self.trials)
+        low, high = self.wilson
+        return f"{self.percent:.1f} ({low:.1f}-{high:.1f})"
 
     @cached_property
     def plus_minus(self) -> float:
         """Half of the 95 % interval of the mean of batches of 20 instances, %.
 
-        As in Figure 4 of the paper; nan of fewer than two batches.
+        As in Figure 4 of the paper.  Student's t is for batches that vary alike: only
+        whole ones count.  nan of fewer than two.
         """
-        batches: dict[int, list[bool]] = {}
-        for trial, episode in self.results:
-            batches.setdefault(trial.index // BATCH_SIZE, []).append(episode.succeeded)
-        if len(batches) < 2:
+        batches: dict[int, list[list[bool]]] = {}
+        for index, succeeded in self._by_instance.items():
+            batches.setdefault(index // BATCH_SIZE, []).append(succeeded)
+        rates = [
+            _mean([one for succeeded in batch for one in succeeded])
+            for batch in batches.values()
+            if len(batch) == BATCH_SIZE
+        ]
+        if len(rates) < 2:
             return float("nan")
-        low, high = t_interval([_mean(batch) for batch in batches.values()])
+        low, high = t_interval(rates)
         return 50 * (high - low)
 
     @cached_property
@@ -144,16 +162,23 @@ def paper_cell(column: Column, level: str) -> PaperCell | None:
 
 
 def compare(first: Cell, second: Cell) -> tuple[int, int, float] | None:
-    """`statistics.mcnemar` over the trials of both cells; None if there are none."""
-    successes = [
-        {(t.index, t.number): e.succeeded for t, e in cell.results}
-        for cell in (first, second)
-    ]
-    common = sorted(successes[0].keys() & successes[1].keys())
-    if not common:
+    """McNemar's exact test of two policies, in the trials that both cells have.
+
+    An instance counts once, for whoever succeeded in more of its trials: they go alike,
+    and ten of them are not ten times the evidence.
+
+    Returns:
+        See `statistics.mcnemar`; None if there are no such trials.
+    """
+    theirs = {(t.index, t.number): e.succeeded for t, e in second.results}
+    leads: Counter[int] = Counter()
+    for trial, episode in first.results:
+        if (key := (trial.index, trial.number)) in theirs:
+            leads[trial.index] += episode.succeeded - theirs[key]
+    if not leads:
         return None
-    ours, theirs = (np.array([of[key] for key in common]) for of in successes)
-    return mcnemar(ours, theirs)
+    values = np.array([*leads.values()])
+    return mcnemar(values > 0, values < 0)
 
 
 def failure_causes(cells: Mapping[Column, Mapping[str, Cell]]) -> list[str]:

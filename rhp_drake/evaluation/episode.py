@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from rhp_drake.errors import InputError
+from rhp_drake.errors import InputError, WorkError
 from rhp_drake.evaluation.failure import describe_ending
 from rhp_drake.evaluation.world import PlanarWorld, Step, World, WorldError
 from rhp_drake.planning.policy import Policy, PolicyError
@@ -77,10 +77,15 @@ def run_episode(
 
     Raises:
         InputError: If the world shows states of another shape than the instance's.
+        WorkError: If the world cannot even begin: that says nothing of the policy.
     """
     goals = instance.goals
-    world.reset()
-    states = [_seen(world, instance)]
+    try:
+        world.reset()
+        states = [_seen(world, instance)]
+    except WorldError as error:
+        name = type(world).__name__
+        raise WorkError(f"the world {name} cannot be reset: {error}") from error
     actions: list[int] = []
     seconds: list[float] = []
     world_seconds = 0.0
@@ -121,7 +126,12 @@ def run_episode(
 
 
 def _seen(world: World, instance: TaskInstance) -> np.ndarray:
-    """The world's state."""
+    """A copy of the world's state.
+
+    Raises:
+        InputError: If it has another shape than the instance's.
+        WorldError: If it is not finite.
+    """
     state = np.array(world.state, dtype=float)
     if state.shape != instance.initial_state.shape:
         raise InputError(

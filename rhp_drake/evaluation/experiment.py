@@ -136,6 +136,9 @@ class Experiment:
                 f"{self.num_instances} instances were asked for; the {self.instances} "
                 f"set has {available}."
             )
+        # Else weights for other numbers of objects are found out after hours.
+        for config in self.columns.values():
+            MakePolicy(config, self.num_objects)
 
     def batches(self) -> list[Batch]:
         """All of them, whole trials one after the other, so that early ends count."""
@@ -198,9 +201,14 @@ def _weights_uri(name: str) -> str:
 def run_batch(batch: Batch, experiment: Experiment) -> list[Episode]:
     """Runs the trials of a batch, in order.
 
-    An episode depends on experiment and trial alone, but for its times.
+    An episode depends on experiment and trial alone, but for its times and for whether
+    they reach a limit.
     """
-    return [_run_trial(trial, experiment) for trial in batch.trials()]
+    instances = load_instances(experiment.instances, experiment.num_objects)
+    return [
+        _run_trial(trial, instances[trial.index], experiment)
+        for trial in batch.trials()
+    ]
 
 
 def run_batches(
@@ -234,9 +242,8 @@ def drawn_physics(trial: Trial, instance: TaskInstance, seed: int) -> ObjectPhys
     return draw_physics(trial.level, instance.initial_state, generator)
 
 
-def _run_trial(trial: Trial, experiment: Experiment) -> Episode:
+def _run_trial(trial: Trial, instance: TaskInstance, experiment: Experiment) -> Episode:
     m, seed = experiment.num_objects, experiment.seed
-    instance = load_instances(experiment.instances, m)[trial.index]
     path = _path(trial)
     physics = drawn_physics(trial, instance, seed)
     world_seed = int(stream(seed, *path, "world").integers(MAX_SEED))

@@ -31,6 +31,7 @@ from rhp_drake.evaluation.plots import draw_figure4, save_picture, to_svg
 from rhp_drake.evaluation.result_plots import draw_success, draw_success_by_time
 from rhp_drake.evaluation.results import Results, read_results
 from rhp_drake.evaluation.statistics import bonferroni
+from rhp_drake.evaluation.tables import format_milliseconds, format_number
 from rhp_drake.files import make_folder, write_atomically
 from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
 
@@ -106,7 +107,7 @@ def write_report(folder: Path, num_recordings: int) -> Report:
     Args:
         folder: See `results`.  With `rhp figure4`'s results in `figure4` the report has
             them, too.
-        num_recordings: So many failures of the most successful policy are recorded.
+        num_recordings: So many failures of the most successful policies are recorded.
 
     Raises:
         InputError: If it is no folder of results, or holds none.
@@ -114,7 +115,7 @@ def write_report(folder: Path, num_recordings: int) -> Report:
     results = read_results(folder)
     make_folder(folder)
     cells = group(results.episodes)
-    pictures = list(_pictures(folder, cells))
+    pictures = list(_pictures(folder, results, cells))
     recordings = list(_record_failures(folder, results, cells, num_recordings))
     context = _context(results, cells) | {
         "pictures": pictures,
@@ -127,7 +128,11 @@ def write_report(folder: Path, num_recordings: int) -> Report:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    templates.filters |= {"number": _number, "p_value": _p_value}
+    templates.filters |= {
+        "number": format_number,
+        "milliseconds": format_milliseconds,
+        "p_value": _p_value,
+    }
     written = []
     for name in ("report.md", "report.html"):
         text = templates.get_template(f"{name}.jinja").render(context)
@@ -138,7 +143,9 @@ def write_report(folder: Path, num_recordings: int) -> Report:
 
 def _context(results: Results, cells: Cells) -> dict[str, Any]:
     """What both templates know."""
-    levels = results.settings["levels"]
+    # Work that is going on may have nothing yet of some.
+    there = {level for of_column in cells.values() for level in of_column}
+    levels = [level for level in results.settings["levels"] if level in there]
     rows = {
         level: {
             column: ShownCell(of_column[level], _paper(results, column, level))
@@ -148,16 +155,21 @@ def _context(results: Results, cells: Cells) -> dict[str, Any]:
         for level in levels
     }
     trials = [trial for trial, _ in results.episodes]
+    # What each cell would have had if all had been run alike.
+    wanted = {(trial.index, trial.number) for trial in trials}
+    comparisons = {level: _comparisons(cells, level) for level in levels}
     return {
         "settings": results.settings,
         "levels": levels,
         "columns": list(cells),
         "rows": rows,
         "causes": failure_causes(cells),
-        "comparisons": {level: _comparisons(cells, level) for level in levels},
+        "comparisons": comparisons,
+        "paired": any(comparisons.values()),
         "num_episodes": len(trials),
         "num_instances": len({trial.index for trial in trials}),
         "num_trials": len({trial.number for trial in trials}),
+        "complete": len(trials) == len(wanted) * len(cells) * len(levels),
         "batch_size": BATCH_SIZE,
         "hours": sum(episode.seconds for _, episode in results.episodes) / 3600,
         "commits": results.commits,
@@ -167,8 +179,12 @@ def _context(results: Results, cells: Cells) -> dict[str, Any]:
 
 
 def _paper(results: Results, column: Column, level: str) -> PaperCell | None:
-    same = results.settings["num_objects"] == NUM_OBJECTS
-    return paper_cell(column, level) if same else None
+    return paper_cell(column, level) if _as_the_paper(results) else None
+
+
+def _as_the_paper(results: Results) -> bool:
+    """Whether the tasks have as many objects as the paper's."""
+    return bool(results.settings["num_objects"] == NUM_OBJECTS)
 
 
 def _comparisons(
@@ -188,17 +204,12 @@ def _comparisons(
     }
 
 
-def _number(value: float, decimals: int = 1) -> str:
-    """A number for people, nothing for nan."""
-    return "" if math.isnan(value) else f"{value:.{decimals}f}"
-
-
 def _p_value(p: float) -> str:
     """A p-value for people."""
     return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
-def _pictures(folder: Path, cells: Cells) -> Iterator[Picture]:
+def _pictures(folder: Path, results: Results, cells: Cells) -> Iterator[Picture]:
     """Draws the pictures, and writes them as files."""
 
     def make(name: str, caption: str, figure: Figure) -> Picture:
@@ -206,15 +217,18 @@ def _pictures(folder: Path, cells: Cells) -> Iterator[Picture]:
         data = base64.b64encode(to_svg(figure).encode()).decode()
         return Picture(name, caption, f"data:image/svg+xml;base64,{data}")
 
+    with_paper = _as_the_paper(results)
+    of_paper = "; dashed and dotted: the paper, on its own tasks" if with_paper else ""
     yield make(
         "success",
         "Success by how much the world's physics differ from what the policy believes, "
-        "with Wilson's 95 % intervals; dashed: the paper, on its own tasks.",
-        draw_success(cells),
+        f"with Wilson's 95 % intervals{of_paper}.",
+        draw_success(cells, with_paper),
     )
     yield make(
         "success_by_time",
-        "Success against mean computation of a decision, with Wilson's 95 % intervals.",
+        "Success against mean computation of a decision, with Wilson's 95 % intervals; "
+        "a panel a level of uncertainty.",
         draw_success_by_time(cells),
     )
     if (folder / _FIGURE4).exists():
@@ -229,11 +243,14 @@ def _pictures(folder: Path, cells: Cells) -> Iterator[Picture]:
 def _record_failures(
     folder: Path, results: Results, cells: Cells, count: int
 ) -> Iterator[Recording]:
-    """Records the first failures of the most successful policy, level by level."""
-    best = max(cells.values(), key=lambda by_level: _mean_percent(by_level.values()))
+    """Records failures, those of the most successful policy first, level by level."""
+    best_first = sorted(
+        cells.values(), key=lambda by_level: -_mean_percent(by_level.values())
+    )
     failures = [
         (trial, episode)
-        for cell in best.values()
+        for by_level in best_first
+        for cell in by_level.values()
         for trial, episode in cell.results
         if not episode.succeeded
     ][:count]

@@ -18,14 +18,16 @@
 | `simulated_seconds` | double | how long it took in the world; 0 without time |
 | `ending` | string | of a failure: what was outside its goal region, and loops |
 
-All but the first two of seconds depend on the experiment alone.  The metadata of each
-file have the key "rhp_drake": JSON with commit of the code and machine.
+All but `decision_seconds` and `world_seconds` depend on the experiment alone, as long
+as no run and no search reaches its limit of computation.  The metadata of each file
+have the key "rhp_drake": JSON with commit of the code and machine.
 
 `settings.json` beside it says what all rows have in common (instances, number of
 objects, world, seed) and what each column's policy is.  A batch of episodes is a file;
 work that is stopped goes on with the batches that are not there.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import hashlib
@@ -57,7 +59,7 @@ _FORMAT: Final = "rhp_drake results 1"
 _SETTINGS: Final = "settings.json"
 _EPISODES: Final = "episodes"
 _METADATA_KEY: Final = b"rhp_drake"
-# Of a file, all settings but those of columns must be those of the experiment.
+# The setting that says what each column's policy is.
 _COLUMNS: Final = "columns"
 
 
@@ -130,7 +132,8 @@ def read_results(folder: Path) -> Results:
     """Reads all episodes of a folder.
 
     Raises:
-        InputError: If it holds no results, or a file is damaged; the message names it.
+        InputError: If it holds no results, or a file is damaged or does not belong
+            there; the message names it.
     """
     settings = _read_settings(folder)
     order = {
@@ -140,9 +143,19 @@ def read_results(folder: Path) -> Results:
     levels = list(settings["levels"])
     episodes: list[tuple[Trial, Episode]] = []
     abouts: list[dict[str, str]] = []
+    seen: set[Trial] = set()
     for path in sorted((folder / _EPISODES).glob("*.parquet")):
         table = _read_table(path)
-        episodes += _from_table(table)
+        for trial, episode in _from_table(table):
+            if trial.column not in order or trial.level not in levels:
+                raise InputError(
+                    f"{path}: holds episodes of {trial.column} ({trial.level}), which "
+                    f"{_SETTINGS} does not know."
+                )
+            if trial in seen:
+                raise InputError(f"{path}: holds episodes that another file has, too.")
+            seen.add(trial)
+            episodes.append((trial, episode))
         abouts.append(json.loads(table.schema.metadata[_METADATA_KEY]))
     if not episodes:
         raise InputError(f"{folder}: holds no episodes yet.")
@@ -163,9 +176,14 @@ def read_results(folder: Path) -> Results:
 
 def _path(folder: Path, batch: Batch) -> Path:
     """Of a batch, by its first instance: more instances of a set go on from there."""
-    column = "_".join(filter(None, (batch.column.policy, batch.column.weights)))
+    column = _file_name(batch.column.policy, batch.column.weights)
     name = f"{column}_{batch.level}_{batch.number:02d}_{batch.indices.start:03d}"
     return folder / _EPISODES / f"{name}.parquet"
+
+
+def _file_name(policy: str, weights: str) -> str:
+    """What the names of a column's files begin with."""
+    return f"{policy}_{weights}" if weights else policy
 
 
 def _check_ours(folder: Path) -> None:
@@ -206,11 +224,24 @@ def _merged_settings(folder: Path, experiment: Experiment) -> dict[str, Any]:
     columns = {(c["policy"], c["weights"]): c for c in noted[_COLUMNS]}
     for column in ours[_COLUMNS]:
         key = column["policy"], column["weights"]
-        if columns.setdefault(key, column) != column:
+        there = columns.setdefault(key, column)
+        if there != column:
+            differences = ", ".join(
+                f"{name} {there.get(name)!r}, not {column.get(name)!r}"
+                for name in {**there, **column}
+                if there.get(name) != column.get(name)
+            )
             raise InputError(
                 f"{folder}: holds results of another policy {' '.join(key).strip()!r} "
-                f"({columns[key]}, not {column}); choose another folder."
+                f"({differences}); choose another folder."
             )
+    # gp_rescue with weights x, and gp with weights rescue_x.
+    names = Counter(_file_name(*key) for key in columns)
+    if clashing := [name for name, count in names.items() if count > 1]:
+        raise InputError(
+            f"{folder}: two policies would have files of the name {clashing[0]!r}; "
+            "rename the weights, or choose another folder."
+        )
     known = {*noted["levels"], *ours["levels"]}
     levels = [level for level in UNCERTAINTY_LEVELS if level in known]
     return ours | {"levels": levels, _COLUMNS: list(columns.values())}
@@ -243,6 +274,9 @@ def _read_settings(folder: Path) -> dict[str, Any]:
         wanted = {"world", "instances", "num_objects", "seed", "levels", _COLUMNS}
         if lacking := wanted - set(settings):
             raise InputError(f"{path}: lacks {min(lacking)!r}.")
+        for column in settings[_COLUMNS]:
+            if lacking := {"policy", "weights"} - set(column):
+                raise InputError(f"{path}: a column lacks {min(lacking)!r}.")
     except FileNotFoundError:
         raise InputError(
             f"{folder}: is no folder of results: there is no {_SETTINGS}."
@@ -329,12 +363,15 @@ def _read_table(path: Path) -> pa.Table:
         file = pq.ParquetFile(path, page_checksum_verification=True)
         if _METADATA_KEY not in (file.schema_arrow.metadata or {}):
             raise InputError(f"{path}: its metadata know of no results.")
+        if lacking := {*_schema(1, {}).names} - {*file.schema_arrow.names}:
+            raise InputError(f"{path}: lacks the column {min(lacking)!r}.")
         return file.read()
     except InputError:
         raise
     except (OSError, ValueError, pa.ArrowException) as error:
         raise InputError(
-            f"{path}: not a readable file of results ({error})."
+            f"{path}: not a readable file of results ({error}); without it, its "
+            "episodes are run again."
         ) from error
 
 

@@ -1,17 +1,54 @@
 """Statistics that every table here uses."""
 
 from collections.abc import Sequence
+import math
 
 import numpy as np
-from scipy.stats import binomtest, t
+from scipy.stats import binomtest, norm, t
 
 
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a success rate."""
+def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
+    """Wilson's 95 % confidence interval of a success rate.
+
+    Numbers need not be whole, see `grouped_wilson_interval`.
+    """
     if trials == 0:
         return 0.0, 1.0
-    interval = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
-    return float(interval.low), float(interval.high)
+    rate = successes / trials
+    z = float(norm.ppf(0.975))
+    shrinkage = 1 / (1 + z**2 / trials)
+    center = shrinkage * (rate + z**2 / (2 * trials))
+    variance = rate * (1 - rate) / trials + (z / (2 * trials)) ** 2
+    half_width = shrinkage * z * math.sqrt(variance)
+    # But for rounding, it is around the rate and within 0 and 1 anyway.
+    low, high = min(rate, center - half_width), max(rate, center + half_width)
+    return max(0.0, low), min(1.0, high)
+
+
+def grouped_wilson_interval(
+    successes: np.ndarray, trials: np.ndarray
+) -> tuple[float, float]:
+    """Wilson's 95 % interval of a success rate whose trials come in groups.
+
+    Trials of the same task go alike, and say less than as many of different tasks.
+    They count as so many independent ones as would have the same variance (Korn and
+    Graubard 1998): as many as there are groups at least, so also where all succeed, and
+    as there are trials at most.  Of one trial a group it is `wilson_interval`.
+
+    Args:
+        successes: Of each group, shape (K,), K >= 1.
+        trials: Of each group, shape (K,), at least 1 each.
+    """
+    groups, total = len(trials), float(trials.sum())
+    rate = float(successes.sum()) / total
+    independent = float(groups)
+    if groups > 1 and 0 < rate < 1:
+        residuals = successes - rate * trials
+        variance = groups / (groups - 1) * float((residuals**2).sum()) / total**2
+        # Where all groups have the same rate, nothing says that trials go alike.
+        independent = rate * (1 - rate) / variance if variance > 0 else total
+        independent = min(max(independent, groups), total)
+    return wilson_interval(rate * independent, independent)
 
 
 def format_rate(successes: int, trials: int) -> str:

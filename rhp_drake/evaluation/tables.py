@@ -1,6 +1,7 @@
 """Results of policies as tables for the terminal."""
 
 from collections.abc import Callable, Sequence
+import math
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -37,9 +38,10 @@ def make_success_table(
         row = [
             cell.rate,
             f"{paper.percent}" if paper else "",
-            f"{cell.num_actions:.1f}",
-            f"{format_milliseconds(p50)} / {format_milliseconds(p95)}",
-            f"{cell.thinking_seconds:.2f}",
+            format_number(cell.num_actions),
+            # A policy that fails at once decides nothing.
+            " / ".join(filter(None, map(format_milliseconds, (p50, p95)))),
+            format_number(cell.thinking_seconds, 2),
         ]
         if time_flows:
             row.append(f"{cell.real_time_rate or 0:.1f}")
@@ -87,9 +89,14 @@ def make_ending_table(cells: Cells, count: int) -> Table:
     return table
 
 
+def format_number(value: float, decimals: int = 1) -> str:
+    """A number for people, nothing for nan."""
+    return "" if math.isnan(value) else f"{value:.{decimals}f}"
+
+
 def format_milliseconds(value: float) -> str:
-    """With a decimal below 100."""
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}"
+    """With a decimal below 100, nothing for nan."""
+    return format_number(value, 0 if value >= 100 else 1)
 
 
 def _table_by_policy(

@@ -17,6 +17,9 @@ file `my_lab.py`, for ``rhp evaluate --world my_lab:make_world``::
 
     def make_world(instance, physics, seed):
         return MyWorld(instance, physics, seed)
+
+A folder of results knows a world by this name alone: whoever changes it takes another
+folder.
 """
 
 from collections.abc import Callable
@@ -46,7 +49,11 @@ class World(Protocol):
         ...
 
     def reset(self) -> None:
-        """Puts everything where the instance has it; comes before the first action."""
+        """Puts everything where the instance has it; comes before the first action.
+
+        Raises:
+            WorldError: If it cannot.
+        """
         ...
 
     def step(self, action: int) -> None:
@@ -108,7 +115,7 @@ def load_world_factory(name: str) -> WorldFactory:
         sys.path.append(here)
     try:
         module = importlib.import_module(module_name)
-    except (ImportError, SyntaxError, ValueError) as error:
+    except (ImportError, SyntaxError, TypeError, ValueError) as error:
         raise InputError(f"the world {name}: cannot be imported: {error}.") from error
     factory = getattr(module, factory_name, None)
     if not callable(factory):

@@ -19,7 +19,8 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import Demultiplexer
 
 from rhp_drake.drivers.natnet_driver import NatNetConfig, TrackedPose
-from rhp_drake.drivers.ur_driver import UrDriverConfig, UrMeasurement
+from rhp_drake.drivers.ur_config import UrDriverConfig
+from rhp_drake.drivers.ur_driver import UrMeasurement
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.station.shown_station import MakeShownStation
 from rhp_drake.station.station_models import StationConfig
