@@ -55,6 +55,14 @@ def test_a_folder_is_a_table(tmp_path):
     assert [t.index for t, _ in read.episodes] == [*range(6)] * 4
 
 
+def test_columns_are_in_the_order_of_the_papers_table(tmp_path):
+    """Whatever was run first."""
+    for policies, weights in ((["rhp33", "gp"], ["best"]), (["kdp", "gp"], ["paper"])):
+        run(tmp_path, experiment(policies, weights, num_instances=1, levels=["none"]))
+    columns = dict.fromkeys(str(t.column) for t, _ in read_results(tmp_path).episodes)
+    assert list(columns) == ["kdp", "gp paper", "gp best", "rhp33 best"]
+
+
 def test_pandas_reads_it(tmp_path):
     pandas = pytest.importorskip("pandas")
     run(tmp_path / "out", work(num_instances=2))

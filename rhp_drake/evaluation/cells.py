@@ -11,8 +11,7 @@ import numpy as np
 from rhp_drake.evaluation.episode import Episode
 from rhp_drake.evaluation.experiment import BATCH_SIZE, Column, Trial
 from rhp_drake.evaluation.paper_results import (
-    IMITATION,
-    REINFORCEMENT,
+    SHIPPED_WEIGHTS,
     TABLE1,
     PaperCell,
 )
@@ -21,15 +20,6 @@ from rhp_drake.evaluation.statistics import (
     mcnemar,
     t_interval,
 )
-
-# How the Q-networks that come with the package learned.
-_LEARNED = {
-    "": "",
-    "imitation": IMITATION,
-    "imitation_set": IMITATION,
-    "paper": REINFORCEMENT,
-    "best": REINFORCEMENT,
-}
 
 
 @dataclass(frozen=True)
@@ -157,7 +147,7 @@ def group(results: Sequence[tuple[Trial, Episode]]) -> Cells:
 
 def paper_cell(column: Column, level: str) -> PaperCell | None:
     """What Table I of the paper says of a policy, None if it has no such one."""
-    key = column.policy, _LEARNED.get(column.weights, "unknown")
+    key = column.policy, SHIPPED_WEIGHTS.get(column.weights, column.weights)
     return TABLE1.get(key, {}).get(level)
 
 

@@ -8,6 +8,13 @@ from rhp_drake.physics import UNCERTAINTY_LEVELS
 # How the Q-network of a column came about; KDP has none.
 IMITATION: Final = "imitation"
 REINFORCEMENT: Final = "reinforcement"
+# And those that come with this package.
+SHIPPED_WEIGHTS: Final = {
+    "imitation": IMITATION,
+    "imitation_set": IMITATION,
+    "paper": REINFORCEMENT,
+    "best": REINFORCEMENT,
+}
 
 
 @dataclass(frozen=True)

@@ -48,10 +48,11 @@ from rhp_drake.evaluation.experiment import (
     Trial,
     run_batches,
 )
+from rhp_drake.evaluation.paper_results import SHIPPED_WEIGHTS
 from rhp_drake.files import exclusive, write_atomically
 from rhp_drake.learning.demonstration_files import lengths, numbers
 from rhp_drake.physics import UNCERTAINTY_LEVELS
-from rhp_drake.planning.policy_config import PolicyConfig
+from rhp_drake.planning.policy_config import POLICIES, PolicyConfig
 from rhp_drake.resources import resolve
 from rhp_drake.workers import Workers
 
@@ -69,7 +70,7 @@ class Results:
 
     Attributes:
         settings: What all episodes have in common.
-        episodes: By policy, in the order of the settings, level, trial and instance.
+        episodes: By policy, as the paper's table, level, trial and instance.
         commits: Of the code that made them.
         machines: That made them.
     """
@@ -136,10 +137,8 @@ def read_results(folder: Path) -> Results:
             there; the message names it.
     """
     settings = _read_settings(folder)
-    order = {
-        Column(entry["policy"], entry["weights"]): number
-        for number, entry in enumerate(settings[_COLUMNS])
-    }
+    columns = [Column(c["policy"], c["weights"]) for c in settings[_COLUMNS]]
+    order = {column: k for k, column in enumerate(sorted(columns, key=_rank))}
     levels = list(settings["levels"])
     episodes: list[tuple[Trial, Episode]] = []
     abouts: list[dict[str, str]] = []
@@ -172,6 +171,19 @@ def read_results(folder: Path) -> Results:
         for key in ("commit", "machine")
     )
     return Results(settings, episodes, commits, machines)
+
+
+def _rank(column: Column) -> tuple[int, int]:
+    """By which columns are sorted: as the paper's table, whatever was run first.
+
+    First those without a Q-network, then each Q-network's, those that come with the
+    package first.  Names that are not known keep their order.
+    """
+    weights, policies = ("", *SHIPPED_WEIGHTS), tuple(POLICIES)
+    return (
+        weights.index(column.weights) if column.weights in weights else len(weights),
+        policies.index(column.policy) if column.policy in policies else len(policies),
+    )
 
 
 def _path(folder: Path, batch: Batch) -> Path:
