@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rhp_drake.commands.options import NumWorkers
+
 # Drake is imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +37,7 @@ def planners(
         float, typer.Option(min=1, help="Of computation for each search, s.")
     ] = 60.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the searches.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    workers: NumWorkers = 2,
 ) -> None:
     """Compares our planners with OMPL's RRT and SST on the same push model.
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rhp_drake.commands.options import NumWorkers
 from rhp_drake.errors import InputError
 
 # torch, Drake and matplotlib are imported in the functions, so that `rhp --help` is
@@ -32,7 +33,7 @@ def reinforcement(
     steps: Annotated[
         int, typer.Option(min=1000, help="Gradient steps of a training.")
     ] = 8000,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    workers: NumWorkers = 2,
 ) -> None:
     """Trains variants of the method, and compares them on validation tasks.
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rhp_drake.commands.options import NumWorkers, RayAddress
 from rhp_drake.errors import InputError
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
@@ -16,9 +17,6 @@ if TYPE_CHECKING:
 
 demos = typer.Typer(invoke_without_command=True)
 
-_Workers = Annotated[
-    int, typer.Option(min=1, help="How many processes work on this machine.")
-]
 _Sources = Annotated[
     list[Path], typer.Argument(help="Files or folders of demonstrations.")
 ]
@@ -59,14 +57,8 @@ def make(
     objects: Annotated[
         int, typer.Option(min=1, max=10, help="How many boxes the tasks have.")
     ] = 3,
-    workers: _Workers = 2,
-    ray: Annotated[
-        str | None,
-        typer.Option(
-            help='Work on the Ray cluster at this address instead; "auto" for the one '
-            "that this machine is part of."
-        ),
-    ] = None,
+    workers: NumWorkers = 2,
+    ray: RayAddress = None,
 ) -> None:
     """Makes demonstrations: plans and all that was simulated to find them.
 
@@ -163,7 +155,7 @@ def _print_summary(paths: list[Path], console: "Console") -> None:
 
 
 @demos.command()
-def verify(sources: _Sources, *, workers: _Workers = 2) -> None:
+def verify(sources: _Sources, *, workers: NumWorkers = 2) -> None:
     """Executes stored plans again, and says how many still reach the goal.
 
     The exit status is 0 if all do, 1 if not: their states may differ a little, for

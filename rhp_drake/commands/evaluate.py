@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from rhp_drake.commands.options import NumWorkers, RayAddress
 from rhp_drake.errors import InputError
 from rhp_drake.physics import UNCERTAINTY_LEVELS
 from rhp_drake.planning.policy_config import POLICIES
@@ -86,14 +87,8 @@ def evaluate(
         float | None, typer.Option(help="tau of RHP's soft-max, in actions.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random draws.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
-    ray: Annotated[
-        str | None,
-        typer.Option(
-            help='Work on the Ray cluster at this address instead; "auto" for the one '
-            "that this machine is part of."
-        ),
-    ] = None,
+    workers: NumWorkers = 2,
+    ray: RayAddress = None,
     out: Annotated[
         Path | None,
         typer.Option(

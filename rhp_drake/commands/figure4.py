@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rhp_drake.commands.options import NumWorkers
 from rhp_drake.errors import InputError
 
 # Drake, torch and matplotlib are imported in the functions, so that `rhp --help` is
@@ -41,7 +42,7 @@ def figure4(
     steps: Annotated[
         int, typer.Option(min=1, help="Gradient steps of a training.")
     ] = 40_000,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    workers: NumWorkers = 2,
 ) -> None:
     """Makes the paper's Figure 4: what the greedy policy learns from how many plans.
 
