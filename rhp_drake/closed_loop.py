@@ -119,6 +119,7 @@ def MakeClosedLoop(
     for ours, theirs in (
         ("ur5.age", "arm_age"),
         ("ur5.fault", "arm_fault"),
+        ("object_poses", "object_poses"),
         ("object_ages", "object_ages"),
     ):
         builder.Connect(station.GetOutputPort(ours), guard.GetInputPort(theirs))

@@ -32,6 +32,7 @@ class Fault(enum.IntEnum):
     EMERGENCY_STOP = 10
     NOT_RUNNING = 11
     CONNECTION_LOST = 12
+    OBJECT_TILTED = 13
 
 
 _SENTENCES: Final = {
@@ -49,6 +50,7 @@ _SENTENCES: Final = {
     "fault.",
     Fault.NOT_RUNNING: "the robot is off, or its program does not run.",
     Fault.CONNECTION_LOST: "the connection to the robot is lost.",
+    Fault.OBJECT_TILTED: "an object does not stand upright.",
 }
 
 

@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.common.yaml import yaml_load_typed
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 import pytest
 
@@ -37,7 +39,18 @@ class Bench:
         self.guard.GetInputPort("position").FixValue(self.context, desired)
         self.guard.GetInputPort("position_measured").FixValue(self.context, measured)
 
-    def know(self, *, arm_age=0.0, arm_fault=Fault.NONE, object_ages=(0.0, 0.0)):
+    def know(
+        self,
+        *,
+        arm_age=0.0,
+        arm_fault=Fault.NONE,
+        object_ages=(0.0, 0.0),
+        roll_deg=0.0,
+        x=0.5,
+    ):
+        tilted = RigidTransform(RollPitchYaw(np.deg2rad(roll_deg), 0, 1), [x, 0, 0.03])
+        poses = AbstractValue.Make([RigidTransform([0.5, 0.2, 0.03]), tilted])
+        self.guard.GetInputPort("object_poses").FixValue(self.context, poses)
         for name, value in (
             ("arm_age", [arm_age]),
             ("arm_fault", [float(arm_fault)]),
@@ -193,12 +206,18 @@ def test_bad_config(config):
         ({"object_ages": (math.inf, 0.0)}, Fault.STALE_POSE),
         ({"object_ages": (0.0, math.nan)}, Fault.STALE_POSE),
         ({"arm_fault": Fault.PROTECTIVE_STOP}, Fault.PROTECTIVE_STOP),
+        ({"roll_deg": 16.0}, Fault.OBJECT_TILTED),
+        ({"roll_deg": -90.0}, Fault.OBJECT_TILTED),
+        ({"roll_deg": 90.0, "object_ages": (0.0, 1.0)}, Fault.STALE_POSE),
         ({"arm_fault": Fault.CONNECTION_LOST}, Fault.CONNECTION_LOST),
     ],
 )
 def test_old_measurements_and_faults_of_the_robot_stop_the_arm(known, expected):
     dut = Bench()
-    dut.know(arm_age=0.09, object_ages=(0.49, 0.0))
+    dut.know(arm_age=0.09, object_ages=(0.49, 0.0), roll_deg=14.0)
+    assert dut.tick(START)[1] == Fault.NONE
+    # It falls off the table.
+    dut.know(roll_deg=60.0, x=0.95)
     assert dut.tick(START)[1] == Fault.NONE
     dut.know(**known)
     moved = np.add(START, [SMALL, 0, 0, 0, 0, 0])

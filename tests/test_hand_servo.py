@@ -3,9 +3,15 @@
 import math
 
 import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, DiscreteTimeDelay
+from pydrake.systems.primitives import (
+    ConstantValueSource,
+    ConstantVectorSource,
+    DiscreteTimeDelay,
+)
 import pytest
 
 from rhp_drake.safety import Fault
@@ -225,6 +231,11 @@ class ServoAndGuard:
         self.target = builder.AddSystem(ConstantVectorSource(np.zeros(3)))
         servo = builder.AddSystem(HandServo())
         self.guard = builder.AddSystem(CommandGuard(CommandGuardConfig(), 1))
+        poses = AbstractValue.Make([RigidTransform([0.5, 0.0, 0.03])])
+        source = builder.AddSystem(ConstantValueSource(poses))
+        builder.Connect(
+            source.get_output_port(), self.guard.GetInputPort("object_poses")
+        )
         for name in ("arm_age", "arm_fault", "object_ages"):
             zero = builder.AddSystem(ConstantVectorSource(np.zeros(1)))
             builder.Connect(zero.get_output_port(), self.guard.GetInputPort(name))

@@ -5,6 +5,8 @@ import math
 from typing import Final
 
 import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
@@ -12,10 +14,17 @@ from rhp_drake.safety import Fault, JointLimits, check_command
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.station.ur5_kinematics import PUSHING_HEIGHT, forward_kinematics
 from rhp_drake.systems.latching import latch_position
-from rhp_drake.task import WORKSPACE_LOWER, WORKSPACE_UPPER
+from rhp_drake.task import (
+    TABLE_LOWER,
+    TABLE_UPPER,
+    WORKSPACE_LOWER,
+    WORKSPACE_UPPER,
+)
 
 # The hand's z axis may lean by so much: its fingers reach 0.1 m around it.
 _LEAST_UPRIGHT: Final = math.cos(math.radians(2))
+# An object's: far more than a tracker errs by.  What looks ahead knows none that lie.
+_LEAST_STANDING: Final = math.cos(math.radians(15))
 
 
 @dataclass
@@ -68,13 +77,15 @@ class CommandGuard(LeafSystem):
         - position_measured
         - arm_age
         - arm_fault
+        - object_poses
         - object_ages
         output_ports:
         - position
         - fault
 
     The positions have size 6 (rad), the ages (s) size 1 and m; `arm_fault` and `fault`
-    have size 1, a value of `safety.Fault`.
+    have size 1, a value of `safety.Fault`.  `object_poses` is a list of the m poses X_WB,
+    z of B upwards.
 
     Args:
         config: The limits.
@@ -93,6 +104,9 @@ class CommandGuard(LeafSystem):
         )
         self._arm_age_port = self.DeclareVectorInputPort(name="arm_age", size=1)
         self._arm_fault_port = self.DeclareVectorInputPort(name="arm_fault", size=1)
+        self._object_poses_port = self.DeclareAbstractInputPort(
+            name="object_poses", model_value=AbstractValue.Make([RigidTransform()])
+        )
         self._object_ages_port = self.DeclareVectorInputPort(
             name="object_ages", size=num_objects
         )
@@ -142,6 +156,12 @@ class CommandGuard(LeafSystem):
         ages = self._object_ages_port.Eval(context)
         if not (ages <= self._config.object_age_limit).all():
             return Fault.STALE_POSE
+        for X_WB in self._object_poses_port.Eval(context):
+            # Beyond the table's edge it falls, which is for the planner to see.
+            x, y, _ = X_WB.translation()
+            on_table = ((x, y) >= TABLE_LOWER).all() and ((x, y) <= TABLE_UPPER).all()
+            if on_table and X_WB.rotation().matrix()[2, 2] < _LEAST_STANDING:
+                return Fault.OBJECT_TILTED
         return Fault.NONE
 
     def _CheckHand(self, desired: np.ndarray) -> Fault:
