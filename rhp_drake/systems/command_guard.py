@@ -84,8 +84,8 @@ class CommandGuard(LeafSystem):
         - fault
 
     The positions have size 6 (rad), the ages (s) size 1 and m; `arm_fault` and `fault`
-    have size 1, a value of `safety.Fault`.  `object_poses` is a list of the m poses X_WB,
-    z of B upwards.
+    have size 1, a value of `safety.Fault`.  `object_poses` is a list of the m poses
+    X_WB, z of B upwards.
 
     Args:
         config: The limits.
