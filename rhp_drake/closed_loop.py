@@ -4,7 +4,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import (
+    Diagram,
+    DiagramBuilder,
+    InputPort,
+    OutputPort,
+)
 from pydrake.systems.primitives import ConstantVectorSource
 
 from rhp_drake.errors import InputError
@@ -61,6 +66,70 @@ def MakeStation(
         raise InputError(f"station: {error}") from error
 
 
+@dataclass(frozen=True)
+class Robot:
+    """Ports of a robot that goes where its hand is sent.
+
+    Attributes:
+        state: Output of size 3 + 3 m.
+        at_rest: Output of size 1.
+        fault: Output of size 1, a `safety.Fault`.
+        hand_target: Input of size 3.
+    """
+
+    state: OutputPort
+    at_rest: OutputPort
+    fault: OutputPort
+    hand_target: InputPort
+
+
+def AddRobot(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    meshcat: "Meshcat | None" = None,
+    hardware: Hardware | None = None,
+) -> Robot:
+    """Adds the loop but for who decides: station, estimator, servo and guard.
+
+    Args:
+        builder: Gets the systems.
+        scenario: Says which station.
+        meshcat: Where to show it, if anywhere.
+        hardware: The drivers; None to simulate.
+
+    Raises:
+        InputError: If there is no such station.
+    """
+    m = len(scenario.station.objects)
+    station = MakeStation(scenario, meshcat, hardware)
+    builder.AddNamedSystem("station", station)
+    estimator = builder.AddNamedSystem("state_estimator", StateEstimator(m))
+    servo = builder.AddNamedSystem("hand_servo", HandServo())
+    guard = builder.AddNamedSystem("command_guard", CommandGuard(scenario.guard, m))
+    for theirs, system, ours in (
+        ("ur5.position_measured", estimator, "position_measured"),
+        ("ur5.velocity_estimated", estimator, "velocity_estimated"),
+        ("object_poses", estimator, "object_poses"),
+        ("ur5.position_measured", servo, "position_measured"),
+        ("ur5.position_measured", guard, "position_measured"),
+        ("ur5.age", guard, "arm_age"),
+        ("ur5.fault", guard, "arm_fault"),
+        ("object_poses", guard, "object_poses"),
+        ("object_ages", guard, "object_ages"),
+    ):
+        builder.Connect(station.GetOutputPort(theirs), system.GetInputPort(ours))
+    builder.Connect(servo.GetOutputPort("position"), guard.GetInputPort("position"))
+    builder.Connect(
+        guard.GetOutputPort("position"), station.GetInputPort("ur5.position")
+    )
+    return Robot(
+        state=estimator.GetOutputPort("state"),
+        at_rest=estimator.GetOutputPort("at_rest"),
+        fault=guard.GetOutputPort("fault"),
+        hand_target=servo.GetInputPort("hand_target"),
+    )
+
+
 def MakeClosedLoop(
     scenario: Scenario,
     policy: Policy,
@@ -86,61 +155,30 @@ def MakeClosedLoop(
     """
     m = len(scenario.station.objects)
     builder = DiagramBuilder()
-    station = MakeStation(scenario, meshcat, hardware)
-    builder.AddNamedSystem("station", station)
-    estimator = builder.AddNamedSystem("state_estimator", StateEstimator(m))
+    robot = AddRobot(builder, scenario, meshcat, hardware)
     goals = builder.AddNamedSystem("goals", ConstantVectorSource(np.zeros(2 * m)))
     planner = builder.AddNamedSystem("planner", RecedingHorizonPlanner(policy, m))
-    servo = builder.AddNamedSystem("hand_servo", HandServo())
-    guard = builder.AddNamedSystem("command_guard", CommandGuard(scenario.guard, m))
-
-    state = estimator.GetOutputPort("state")
-    goal_vector = goals.get_output_port()
-    decision = planner.GetOutputPort("decision")
-    measured = station.GetOutputPort("ur5.position_measured")
-
-    builder.Connect(measured, estimator.GetInputPort("position_measured"))
-    builder.Connect(
-        station.GetOutputPort("ur5.velocity_estimated"),
-        estimator.GetInputPort("velocity_estimated"),
-    )
-    builder.Connect(
-        station.GetOutputPort("object_poses"), estimator.GetInputPort("object_poses")
-    )
-    builder.Connect(state, planner.GetInputPort("state"))
-    builder.Connect(estimator.GetOutputPort("at_rest"), planner.GetInputPort("at_rest"))
-    builder.Connect(goal_vector, planner.GetInputPort("goals"))
-    builder.Connect(
-        planner.GetOutputPort("hand_target"), servo.GetInputPort("hand_target")
-    )
-    builder.Connect(measured, servo.GetInputPort("position_measured"))
-    builder.Connect(servo.GetOutputPort("position"), guard.GetInputPort("position"))
-    builder.Connect(measured, guard.GetInputPort("position_measured"))
-    for ours, theirs in (
-        ("ur5.age", "arm_age"),
-        ("ur5.fault", "arm_fault"),
-        ("object_poses", "object_poses"),
-        ("object_ages", "object_ages"),
-    ):
-        builder.Connect(station.GetOutputPort(ours), guard.GetInputPort(theirs))
-    builder.Connect(
-        guard.GetOutputPort("position"), station.GetInputPort("ur5.position")
-    )
+    builder.Connect(robot.state, planner.GetInputPort("state"))
+    builder.Connect(robot.at_rest, planner.GetInputPort("at_rest"))
+    builder.Connect(goals.get_output_port(), planner.GetInputPort("goals"))
+    builder.Connect(planner.GetOutputPort("hand_target"), robot.hand_target)
 
     if meshcat is not None:
         # Imported here because a run without pictures needs none of it.
         from rhp_drake.systems.meshcat_overlay import MeshcatOverlay
 
         overlay = builder.AddNamedSystem("overlay", MeshcatOverlay(meshcat, m))
-        builder.Connect(state, overlay.GetInputPort("state"))
-        builder.Connect(goal_vector, overlay.GetInputPort("goals"))
-        builder.Connect(decision, overlay.GetInputPort("decision"))
+        builder.Connect(robot.state, overlay.GetInputPort("state"))
+        builder.Connect(goals.get_output_port(), overlay.GetInputPort("goals"))
+        builder.Connect(
+            planner.GetOutputPort("decision"), overlay.GetInputPort("decision")
+        )
 
-    builder.ExportOutput(state, "state")
-    builder.ExportOutput(goal_vector, "goals")
+    builder.ExportOutput(robot.state, "state")
+    builder.ExportOutput(goals.get_output_port(), "goals")
     for name in ("decision", "status", "message"):
         builder.ExportOutput(planner.GetOutputPort(name), name)
-    builder.ExportOutput(guard.GetOutputPort("fault"), "fault")
+    builder.ExportOutput(robot.fault, "fault")
     diagram = builder.Build()
     diagram.set_name("closed_loop")
     return diagram

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 
 from rhp_drake.errors import InputError, WorkError
-from rhp_drake.evaluation.failure import describe_ending
+from rhp_drake.evaluation.failure import cause_of_failure, describe_ending
 from rhp_drake.evaluation.world import PlanarWorld, Step, World, WorldError
-from rhp_drake.planning.policy import Policy, PolicyError
+from rhp_drake.planning.policy import PlanEndedError, Policy, PolicyError
 from rhp_drake.planning.receding_horizon import RecedingHorizon
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.random_streams import stream
@@ -21,6 +21,8 @@ from rhp_drake.value.q_network import QNetwork
 # s of computation, of policy and world together; section VII-B.
 TIME_LIMIT: Final = 120.0
 SUCCEEDED: Final = "succeeded"
+OBJECT_FELL: Final = "object fell"
+WORLD_FAILED: Final = "world failed"
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,9 @@ class Episode:
     """How a run went.
 
     Attributes:
-        outcome: "succeeded", "out of actions", "out of time", "object fell", "policy
-            failed", "world failed", and in the station whatever else stopped it.
+        outcome: "succeeded"; "obstacle moved" where the target is home at the end and
+            an obstacle is not; else what ended the run: "out of actions", "out of
+            time", "plan ended", "policy failed", "object fell" or "world failed".
         actions: Those executed, L of them.
         states: Before each action and at the end, shape (L + 1, 3 + 3 m); the last one
             is not there if the world failed.
@@ -79,50 +82,80 @@ def run_episode(
         InputError: If the world shows states of another shape than the instance's.
         WorkError: If the world cannot even begin: that says nothing of the policy.
     """
-    goals = instance.goals
     try:
         world.reset()
-        states = [_seen(world, instance)]
+        so_far = _SoFar([_seen(world, instance)])
     except WorldError as error:
         name = type(world).__name__
         raise WorkError(f"the world {name} cannot be reset: {error}") from error
-    actions: list[int] = []
-    seconds: list[float] = []
-    world_seconds = 0.0
+    outcome, problem = _play(world, policy, instance, seed, path, so_far)
+    ending = ""
+    if outcome != SUCCEEDED:
+        last = so_far.states[-1]
+        if outcome not in (OBJECT_FELL, WORLD_FAILED):
+            outcome = cause_of_failure(outcome, last, instance.goals)
+        described = describe_ending(so_far.states, instance.goals)
+        ending = " ".join(filter(None, [problem, described]))
+    return Episode(
+        outcome,
+        so_far.actions,
+        np.array(so_far.states),
+        so_far.decision_seconds,
+        so_far.world_seconds,
+        # Only worlds in which time flows have one.
+        getattr(world, "simulated_seconds", 0.0),
+        ending,
+    )
+
+
+@dataclass
+class _SoFar:
+    """A run as far as it has come; see `Episode`."""
+
+    states: list[np.ndarray]
+    actions: list[int] = field(default_factory=list)
+    decision_seconds: list[float] = field(default_factory=list)
+    world_seconds: float = 0.0
+
+
+def _play(
+    world: World,
+    policy: Policy,
+    instance: TaskInstance,
+    seed: int,
+    path: tuple[str | int, ...],
+    so_far: _SoFar,
+) -> tuple[str, str]:
+    """Runs until the end; returns what ended it, and in words if something failed."""
     memory = None
-    outcome = "out of actions"
-    while len(actions) < MAX_ACTIONS:
-        if sum(seconds) + world_seconds > TIME_LIMIT:
-            outcome = "out of time"
-            break
-        generator = stream(seed, *path, "decision", len(actions))
+    while len(so_far.actions) < MAX_ACTIONS:
+        if sum(so_far.decision_seconds) + so_far.world_seconds > TIME_LIMIT:
+            return "out of time", ""
+        generator = stream(seed, *path, "decision", len(so_far.actions))
         begin = time.perf_counter()
         try:
-            decision = policy.decide(states[-1], goals, generator, memory)
-        except (PolicyError, PushModelError):
-            outcome = "policy failed"
-            break
+            decision = policy.decide(
+                so_far.states[-1], instance.goals, generator, memory
+            )
+        except PlanEndedError:
+            return "plan ended", ""
+        except (PolicyError, PushModelError) as error:
+            return "policy failed", str(error)
         decided = time.perf_counter()
-        seconds.append(decided - begin)
+        so_far.decision_seconds.append(decided - begin)
+        so_far.actions.append(decision.action)
         memory = decision.memory
-        actions.append(decision.action)
         try:
             world.step(decision.action)
-            states.append(_seen(world, instance))
-        except WorldError:
-            outcome = "world failed"
-            break
-        world_seconds += time.perf_counter() - decided
-        if objects_fallen(states[-1]):
-            outcome = "object fell"
-            break
-        if goals_reached(states[-1], goals):
-            outcome = SUCCEEDED
-            break
-    ending = "" if outcome == SUCCEEDED else describe_ending(states, goals)
-    return Episode(
-        outcome, actions, np.array(states), seconds, world_seconds, ending=ending
-    )
+            so_far.states.append(_seen(world, instance))
+        except WorldError as error:
+            return WORLD_FAILED, str(error)
+        finally:
+            so_far.world_seconds += time.perf_counter() - decided
+        fallen = objects_fallen(so_far.states[-1])
+        if fallen or goals_reached(so_far.states[-1], instance.goals):
+            return OBJECT_FELL if fallen else SUCCEEDED, ""
+    return "out of actions", ""
 
 
 def _seen(world: World, instance: TaskInstance) -> np.ndarray:

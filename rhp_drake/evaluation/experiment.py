@@ -2,13 +2,18 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rhp_drake.errors import InputError
 from rhp_drake.evaluation.episode import Episode, run_episode
-from rhp_drake.evaluation.world import PlanarWorld, World, load_world_factory
+from rhp_drake.evaluation.world import (
+    PlanarWorld,
+    World,
+    WorldFactory,
+    load_world_factory,
+)
 from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
 from rhp_drake.physics import UNCERTAINTY_LEVELS, ObjectPhysics, draw_physics
 from rhp_drake.planning.policy import Policy
@@ -27,7 +32,7 @@ from rhp_drake.task import TaskInstance
 from rhp_drake.workers import Workers, run_over
 
 if TYPE_CHECKING:
-    from rhp_drake.evaluation.station_world import StationWorld
+    from pydrake.systems.analysis import Simulator
 
 PLANAR: Final = "planar"
 STATION: Final = "station"
@@ -220,8 +225,14 @@ def run_batches(
 
 # What a process keeps from batch to batch: it is dear to make.
 _policies: dict[str, Policy] = {}
-_push_models: dict[int, PushModel] = {}
-_stations: dict[str, "StationWorld"] = {}
+_push_model = cache(PushModel)
+
+
+@cache
+def _station_simulator() -> "Simulator":
+    from rhp_drake.evaluation.station_world import MakeStationSimulator
+
+    return MakeStationSimulator()
 
 
 def _path(trial: Trial) -> tuple[str | int, ...]:
@@ -251,22 +262,27 @@ def _run_trial(trial: Trial, instance: TaskInstance, experiment: Experiment) -> 
     if key not in _policies:
         _policies[key] = MakePolicy(experiment.columns[trial.column], m)
     policy = _policies[key]
-    if experiment.world == STATION:
-        from rhp_drake.evaluation.station_world import StationWorld
-
-        if key not in _stations:
-            _stations[key] = StationWorld(policy)
-        return _stations[key].run_episode(instance, physics, world_seed)
-    world: World
-    if experiment.world == PLANAR:
-        world = _planar_world(instance, physics)
-    else:
-        world = load_world_factory(experiment.world)(instance, physics, world_seed)
+    make_world = _WORLDS.get(experiment.world) or load_world_factory(experiment.world)
+    world = make_world(instance, physics, world_seed)
     return run_episode(world, policy, instance, seed, *path)
 
 
-def _planar_world(instance: TaskInstance, physics: ObjectPhysics) -> PlanarWorld:
-    m = instance.num_objects
-    if m not in _push_models:
-        _push_models[m] = PushModel(m)
-    return PlanarWorld(partial(_push_models[m].step, physics=physics), instance)
+def _make_planar_world(
+    instance: TaskInstance, physics: ObjectPhysics, seed: int
+) -> World:
+    push_model = _push_model(instance.num_objects)
+    return PlanarWorld(partial(push_model.step, physics=physics), instance)
+
+
+def _make_station_world(
+    instance: TaskInstance, physics: ObjectPhysics, seed: int
+) -> World:
+    from rhp_drake.evaluation.station_world import StationWorld
+
+    return StationWorld(_station_simulator(), instance, physics)
+
+
+_WORLDS: Final[dict[str, WorldFactory]] = {
+    PLANAR: _make_planar_world,
+    STATION: _make_station_world,
+}

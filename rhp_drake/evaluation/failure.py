@@ -1,11 +1,29 @@
 """What can be said of a run that failed, from the states it came through."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from rhp_drake.planning.search import near_any
 from rhp_drake.task import GOAL_RADIUS, object_positions
+
+OBSTACLE_MOVED: Final = "obstacle moved"
+
+
+def cause_of_failure(ended: str, state: np.ndarray, goals: np.ndarray) -> str:
+    """Why a run failed that ended without the goal.
+
+    Args:
+        ended: What ended it, such as "out of actions".
+        state: The last one, shape (3 + 3 m,).
+        goals: Shape (m, 2).
+
+    Returns:
+        The same, or `OBSTACLE_MOVED` if the target is home all the same.
+    """
+    offsets = np.linalg.norm(object_positions(state) - goals, axis=-1)
+    return OBSTACLE_MOVED if offsets[0] <= GOAL_RADIUS < offsets.max() else ended
 
 
 def describe_ending(states: Sequence[np.ndarray], goals: np.ndarray) -> str:

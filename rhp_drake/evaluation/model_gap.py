@@ -3,28 +3,22 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 import logging
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from pydrake.systems.analysis import Simulator
 
-from rhp_drake.closed_loop import MakeClosedLoop
+from rhp_drake.evaluation.station_world import MakeStationSimulator, StationWorld
+from rhp_drake.evaluation.world import WorldError
 from rhp_drake.physics import nominal_physics
-from rhp_drake.planning.policy import Decision, PolicyError
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import VALIDATION, stream
-from rhp_drake.run_closed_loop import SUCCEEDED, run_closed_loop
-from rhp_drake.scenario import Scenario
-from rhp_drake.systems.receding_horizon_planner import Status
 from rhp_drake.task import (
-    HAND_ACTIONS,
     NUM_ACTIONS,
     WORKSPACE_LOWER,
     WORKSPACE_UPPER,
     Action,
     TaskInstance,
     allowed_actions,
-    goals_reached,
     object_positions,
     overlapping_bodies,
     sample_instance,
@@ -36,8 +30,6 @@ _logger = logging.getLogger("rhp_drake")
 _REACH: Final = 0.12
 # ...and the push model must see a box move at least this far.
 _LEAST_MOTION: Final = 0.005
-# How a run of one action ends: its policy has no other, or the task is done by chance.
-_DONE: Final = (Status.POLICY_FAILED.name.lower(), SUCCEEDED)
 
 
 @dataclass(frozen=True)
@@ -78,24 +70,6 @@ def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.hypot(offsets[:, 0], offsets[:, 1])
 
 
-@dataclass(frozen=True)
-class _OneAction:
-    """The policy that executes one action and gives up."""
-
-    action: Action
-
-    def decide(
-        self,
-        state: np.ndarray,
-        goals: np.ndarray,
-        generator: np.random.Generator,
-        memory: Any = None,
-    ) -> Decision:
-        if memory is not None:
-            raise PolicyError("the action is done.")
-        return Decision(self.action, float("nan"), memory="done")
-
-
 def _sample_push(
     push_model: PushModel, generator: np.random.Generator
 ) -> tuple[TaskInstance, Action, np.ndarray]:
@@ -114,10 +88,7 @@ def _sample_push(
             continue
         after = push_model.step(state[None], np.array([action]))[0]
         motion = object_positions(after) - object_positions(state)
-        # A task that the action completes would end before the action is done.
-        if np.linalg.norm(motion, axis=1).max() > _LEAST_MOTION and not goals_reached(
-            after, instance.goals
-        ):
+        if np.linalg.norm(motion, axis=1).max() > _LEAST_MOTION:
             return TaskInstance(state, instance.goals), action, after
 
 
@@ -130,26 +101,17 @@ def compare_pushes(num_pushes: int, seed: int, num_objects: int = 3) -> Iterator
         num_objects: m.
     """
     push_model = PushModel(num_objects)
-    simulators = {
-        action: Simulator(MakeClosedLoop(Scenario(), _OneAction(action)))
-        for action in map(Action, HAND_ACTIONS)
-    }
+    simulator = MakeStationSimulator()
     for index in range(num_pushes):
         instance, action, expected = _sample_push(
             push_model, stream(seed, VALIDATION, "model_gap", index)
         )
-        simulator = simulators[action]
-        outcome = run_closed_loop(
-            simulator, instance, nominal_physics(num_objects), seed=0
-        )
-        if outcome.status not in _DONE:
-            # E.g. a box fell; what was measured is worth more than this one.
-            _logger.warning("push %d is left out: %s", index, outcome.message)
+        world = StationWorld(simulator, instance, nominal_physics(num_objects))
+        try:
+            world.reset()
+            world.step(action)
+        except WorldError as error:
+            # What was measured is worth more than this one.
+            _logger.warning("push %d is left out: %s", index, error)
             continue
-        state = simulator.get_system().GetOutputPort("state")
-        yield Push(
-            action,
-            instance.initial_state,
-            expected,
-            state.Eval(simulator.get_context()).copy(),
-        )
+        yield Push(action, instance.initial_state, expected, world.state)

@@ -1,69 +1,114 @@
-"""Episodes in the station: the robot, its servo and contact in three dimensions.
+"""The station as a world: the robot, its servo and contact in three dimensions.
 
-The station is no `World` for `run_episode`: there the policy sits in the diagram, as on
-a robot, and it is the planner system that waits until the scene is at rest.
+It is the loop of `rhp run`, but that the hand is sent from outside.
 """
-
-import time
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
-from rhp_drake.closed_loop import MakeClosedLoop
-from rhp_drake.evaluation.episode import Episode
-from rhp_drake.evaluation.failure import describe_ending
+from rhp_drake.closed_loop import AddRobot
+from rhp_drake.evaluation.world import WorldError
 from rhp_drake.physics import ObjectPhysics
-from rhp_drake.planning.policy import Policy
-from rhp_drake.run_closed_loop import SUCCEEDED, run_closed_loop
+from rhp_drake.safety import Fault, describe
 from rhp_drake.scenario import Scenario
-from rhp_drake.systems.receding_horizon_planner import DecisionRecord
-from rhp_drake.task import TaskInstance
+from rhp_drake.station.simulated_station import SetStationState
+from rhp_drake.systems.receding_horizon_planner import (
+    PATIENCE,
+    PLANNER_PERIOD,
+    has_arrived,
+)
+from rhp_drake.task import TaskInstance, hand_targets, objects_fallen
+
+
+def MakeStationSimulator() -> Simulator:
+    """A simulator of the default station, whose hand goes where it is sent.
+
+    Its diagram has the input `hand_target` and the outputs `state`, `at_rest` and
+    `fault`, see `closed_loop.Robot`.  One serves any number of worlds in turn.
+    """
+    builder = DiagramBuilder()
+    robot = AddRobot(builder, Scenario())
+    builder.ExportInput(robot.hand_target, "hand_target")
+    for name in ("state", "at_rest", "fault"):
+        builder.ExportOutput(getattr(robot, name), name)
+    return Simulator(builder.Build())
 
 
 class StationWorld:
-    """One closed loop of the default station, which runs instance after instance.
+    """A `World` in a station; it owns the simulator from its reset to its last step.
 
     Args:
-        policy: Who decides.
+        simulator: From `MakeStationSimulator`.
+        instance: Where it begins.
+        physics: Of the objects.
     """
 
-    def __init__(self, policy: Policy) -> None:
-        scenario = Scenario()
-        self._time_limit = scenario.time_limit
-        self._simulator = Simulator(MakeClosedLoop(scenario, policy))
+    def __init__(
+        self, simulator: Simulator, instance: TaskInstance, physics: ObjectPhysics
+    ) -> None:
+        self._simulator = simulator
+        self._diagram = simulator.get_system()
+        self._instance = instance
+        self._physics = physics
 
-    def run_episode(
-        self, instance: TaskInstance, physics: ObjectPhysics, seed: int
-    ) -> Episode:
-        """Runs the policy on an instance.
+    @property
+    def state(self) -> np.ndarray:
+        """See `World`."""
+        return self._output("state").copy()
 
-        Args:
-            instance: What to do.
-            physics: Of the objects in the world.
-            seed: Of the policy's draws, see `RecedingHorizonPlanner.set_seed`.
+    @property
+    def simulated_seconds(self) -> float:
+        """See `World`."""
+        return self._simulator.get_context().get_time()
+
+    def reset(self) -> None:
+        """See `World`."""
+        context = self._simulator.get_mutable_context()
+        context.SetTime(0.0)
+        self._diagram.SetDefaultContext(context)
+        station = self._diagram.GetSubsystemByName("station")
+        SetStationState(
+            station,
+            station.GetMyMutableContextFromRoot(context),
+            self._instance.initial_state,
+            self._physics,
+        )
+        self._send_hand(self._instance.initial_state[:3])
+        self._simulator.Initialize()
+        self._wait(self._instance.initial_state[:3])
+
+    def step(self, action: int) -> None:
+        """See `World`."""
+        target = hand_targets(self.state, np.array(action))
+        self._send_hand(target)
+        self._wait(target)
+
+    def _send_hand(self, target: np.ndarray) -> None:
+        port = self._diagram.GetInputPort("hand_target")
+        port.FixValue(self._simulator.get_mutable_context(), target)
+
+    def _wait(self, target: np.ndarray) -> None:
+        """Until the hand is at its target and all is at rest, or an object has fallen.
+
+        Raises:
+            WorldError: If that takes too long, or the arm was stopped.
         """
-        records: list[DecisionRecord] = []
-        begin = time.perf_counter()
-        outcome = run_closed_loop(
-            self._simulator,
-            instance,
-            physics,
-            seed=seed,
-            time_limit=self._time_limit,
-            on_decision=records.append,
-        )
-        elapsed = time.perf_counter() - begin
-        seconds = [record.milliseconds / 1e3 for record in records]
-        state = self._simulator.get_system().GetOutputPort("state")
-        states = [record.state for record in records]
-        states.append(state.Eval(self._simulator.get_context()).copy())
-        succeeded = outcome.status == SUCCEEDED
-        return Episode(
-            outcome.status.replace("_", " "),
-            [record.decision.action for record in records],
-            np.array(states),
-            seconds,
-            elapsed - sum(seconds),
-            outcome.time,
-            "" if succeeded else describe_ending(states, instance.goals),
-        )
+        end = self.simulated_seconds + PATIENCE
+        while self.simulated_seconds < end:
+            # Between two calls Python handles Ctrl-C, so Drake need not look for it.
+            self._simulator.AdvanceTo(
+                self.simulated_seconds + PLANNER_PERIOD, interruptible=False
+            )
+            fault = Fault(int(self._output("fault")[0]))
+            if fault != Fault.NONE:
+                raise WorldError(f"the arm was stopped: {describe(fault)}")
+            state = self._output("state")
+            if objects_fallen(state):
+                return
+            if has_arrived(state[:3], target) and self._output("at_rest")[0]:
+                return
+        raise WorldError(f"the action is not done after {PATIENCE:g} s.")
+
+    def _output(self, name: str) -> np.ndarray:
+        return self._diagram.GetOutputPort(name).Eval(self._simulator.get_context())

@@ -41,7 +41,11 @@ class WorldError(Exception):
 
 
 class World(Protocol):
-    """The world of one task instance."""
+    """The world of one task instance.
+
+    One in which time flows may also have `simulated_seconds`, the time there since the
+    reset, to be noted with the episode.
+    """
 
     @property
     def state(self) -> np.ndarray:

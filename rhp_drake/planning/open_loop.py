@@ -7,7 +7,7 @@ import numpy as np
 
 from rhp_drake.planning.kinodynamic_rrt import plan
 from rhp_drake.planning.plan_rest import PlanRest
-from rhp_drake.planning.policy import Decision, PolicyError
+from rhp_drake.planning.policy import Decision, PlanEndedError, PolicyError
 from rhp_drake.planning.search import Plan
 from rhp_drake.push_model.transition import PushModel
 
@@ -50,5 +50,5 @@ class OpenLoop:
                 )
             memory = PlanRest(found.actions, found.states)
         if not len(memory.actions):
-            raise PolicyError("the plan has ended and the goal is not reached.")
+            raise PlanEndedError("the plan has ended and the goal is not reached.")
         return memory.decision()

@@ -12,6 +12,10 @@ class PolicyError(Exception):
     """The policy has no action to offer; the message says why."""
 
 
+class PlanEndedError(PolicyError):
+    """The policy's plan was executed to its end, and the goal is not reached."""
+
+
 @dataclass(frozen=True)
 class Decision:
     """What a policy decided in one state, and why.

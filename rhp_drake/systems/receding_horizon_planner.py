@@ -33,6 +33,12 @@ PATIENCE: Final = 5.0  # s
 MAX_SEED: Final = 2**53
 
 
+def has_arrived(hand: np.ndarray, target: np.ndarray) -> bool:
+    """Whether the hand's pose, shape (3,), is the target's, as near as it gets."""
+    x, y, angle = np.abs(hand - target)
+    return bool(np.hypot(x, y) <= ARRIVAL_DISTANCE and angle <= ARRIVAL_ANGLE)
+
+
 class Status(enum.IntEnum):
     """Whether the episode runs, and how it ended."""
 
@@ -232,15 +238,14 @@ class RecedingHorizonPlanner(LeafSystem):
             )
         if objects_fallen(state):
             return episode.ended(Status.OBJECT_FELL, "an object fell off the table.")
-        x, y, angle = np.abs(state[:3] - episode.hand_target)
-        distance = np.hypot(x, y)
-        arrived = distance <= ARRIVAL_DISTANCE and angle <= ARRIVAL_ANGLE
+        arrived = has_arrived(state[:3], episode.hand_target)
         if not (arrived and self._at_rest_port.Eval(context)[0]):
+            x, y, angle = np.abs(state[:3] - episode.hand_target)
             problem = (
                 f"the objects have not come to rest within {PATIENCE} s."
                 if arrived
-                else f"after {PATIENCE} s the hand is still {1000 * distance:.1f} mm "
-                f"and {angle:.3f} rad from its target."
+                else f"after {PATIENCE} s the hand is still "
+                f"{1000 * np.hypot(x, y):.1f} mm and {angle:.3f} rad from its target."
             )
             late = context.get_time() - episode.sent_time >= PATIENCE
             return episode.ended(Status.TIMED_OUT, problem) if late else episode
