@@ -9,7 +9,7 @@ import numpy as np
 
 from rhp_drake.lab.controller import Controller
 from rhp_drake.lab.dashboard_server import DashboardServer
-from rhp_drake.lab.rtde_server import RtdeServer
+from rhp_drake.lab.rtde_server import RtdeServer, Stream
 from rhp_drake.station.ports import COMMAND_PERIOD
 
 START = np.array([0.1, -1.2, 1.5, -1.9, -1.57, 0.3])
@@ -85,3 +85,12 @@ def running_robot(host):
     pipe.close()
     process.join(PATIENCE)
     assert process.exitcode == 0
+
+
+def make_ready(lab):
+    """The robot powered and near `START`, its stream in order, nothing running."""
+    lab("rtde", "set", "stream", Stream.LIVE)
+    lab("controller", "reboot")
+    lab("controller", "release_brakes")
+    lab.since = lab("controller", "outputs")["timestamp"]
+    return lab

@@ -13,7 +13,8 @@ from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform, RollPitchYaw
 import pytest
 
-from rhp_drake.drivers.natnet_driver import NatNetConfig, NatNetDriver, PoseConfig
+from rhp_drake.drivers.natnet_config import NatNetConfig, PoseConfig
+from rhp_drake.drivers.natnet_driver import NatNetDriver
 from rhp_drake.errors import InputError, WorkError
 from rhp_drake.lab.natnet_server import Freeze, NatNetServer
 from rhp_drake.random_streams import stream
@@ -320,7 +321,8 @@ def test_ends_with_the_object(server):
 
 PARENT = """
 import multiprocessing, os, signal, sys
-from rhp_drake.drivers.natnet_driver import NatNetConfig, NatNetDriver
+from rhp_drake.drivers.natnet_config import NatNetConfig
+from rhp_drake.drivers.natnet_driver import NatNetDriver
 
 if __name__ == "__main__":
     port, body = int(sys.argv[1]), sys.argv[2]

@@ -13,7 +13,7 @@ from rhp_drake.errors import InputError
 from rhp_drake.frozen_instances import load_instances
 from rhp_drake.hardware import load_hardware
 from rhp_drake.lab.faults import FAULTS, inject
-from rhp_drake.lab.modes import SafetyMode
+from rhp_drake.lab.modes import RobotMode, SafetyMode
 from rhp_drake.lab.natnet_server import Freeze
 from rhp_drake.lab.rtde_server import Stream
 from rhp_drake.lab.virtual_lab import VirtualLab
@@ -66,15 +66,19 @@ def test_faults_by_their_words(lab):
     inject(lab, "swap target obstacle_1")
 
 
-def test_all_faults_can_be_called_for(lab):
+def test_all_faults_can_be_called_for_and_undone(lab):
     examples = {"object": iter(["target", "obstacle_1"] * 9), "number": iter([0.0] * 9)}
     for word, fault in FAULTS.items():
         arguments = [str(next(examples[kind])) for kind in fault.arguments]
         inject(lab, " ".join([word, *arguments]))
         lab.step()
-    inject(lab, "restart")
-    inject(lab, "clear")
-    inject(lab, "swap target obstacle_1")
+    assert lab.controller.robot_mode != RobotMode.RUNNING  # The last was a reboot.
+    for text in ("restart", "clear", "swap target obstacle_1"):
+        inject(lab, text)
+    lab.step()
+    assert lab.controller.robot_mode == RobotMode.RUNNING
+    assert lab.controller.safety_mode == SafetyMode.NORMAL
+    assert lab.rtde.stream == Stream.LIVE
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,8 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Demultiplexer
 
-from rhp_drake.drivers.natnet_driver import NatNetConfig, TrackedPose
+from rhp_drake.drivers.natnet_config import NatNetConfig
+from rhp_drake.drivers.natnet_driver import TrackedPose
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.drivers.ur_driver import UrMeasurement
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
