@@ -10,6 +10,7 @@ import numpy as np
 from rhp_drake.lab.controller import Controller
 from rhp_drake.lab.dashboard_server import DashboardServer
 from rhp_drake.lab.rtde_server import RtdeServer, Stream
+from rhp_drake.random_streams import stream
 from rhp_drake.station.ports import COMMAND_PERIOD
 
 START = np.array([0.1, -1.2, 1.5, -1.9, -1.57, 0.3])
@@ -29,7 +30,7 @@ def run_lab(host, pipe):
     ur_rtde's constructors hold the interpreter's lock until the robot has answered.
     """
     controller = Controller(START)
-    rtde = RtdeServer(controller, host)
+    rtde = RtdeServer(controller, host, stream(0, "robot_process"))
     dashboard = DashboardServer(controller, host)
     machines = {"controller": controller, "rtde": rtde, "dashboard": dashboard}
     pipe.send(None)

@@ -15,6 +15,7 @@ from rhp_drake.lab.controller import Controller
 from rhp_drake.lab.modes import RobotMode, RuntimeState
 from rhp_drake.lab.rtde_packets import INPUT_TYPES, OUTPUT_TYPES, Recipe
 from rhp_drake.lab.rtde_server import SCRIPT_PORT, RtdeServer, Stream
+from rhp_drake.random_streams import stream
 
 HOST = "127.0.0.22"  # Of this module alone: the robot's ports are fixed.
 
@@ -26,7 +27,7 @@ def controller():
 
 @pytest.fixture
 def server(controller):
-    with closing(RtdeServer(controller, HOST)) as server:
+    with closing(RtdeServer(controller, HOST, stream(0, "rtde"))) as server:
         yield server
 
 
@@ -136,17 +137,17 @@ def test_clients_that_do_not_read(server, controller, client):
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.2", "localhost", ""])
 def test_listens_on_loopback_only(controller, host):
     with pytest.raises(InputError, match="127"):
-        RtdeServer(controller, host)
+        RtdeServer(controller, host, stream(0, "rtde"))
 
 
 def test_taken_ports(server, controller):
     with pytest.raises(InputError, match="cannot listen"):
-        RtdeServer(controller, HOST)
+        RtdeServer(controller, HOST, stream(0, "rtde"))
 
 
 def test_ports_are_free_after_closing(controller):
     for _ in range(2):
-        server = RtdeServer(controller, HOST)
+        server = RtdeServer(controller, HOST, stream(0, "rtde"))
         with closing(RawClient(HOST)) as client:
             client.start(["timestamp"])
             server.close()

@@ -24,15 +24,12 @@ class DashboardServer:
     Args:
         controller: Whose dashboard this is.
         host: Address to listen at, of loopback.
-        beyond_loopback: Whether it may be one that others can reach.
 
     Raises:
         InputError: If it cannot listen there.
     """
 
-    def __init__(
-        self, controller: Controller, host: str, beyond_loopback: bool = False
-    ) -> None:
+    def __init__(self, controller: Controller, host: str) -> None:
         self._controller = controller
         self._answers: dict[str, Callable[[], str]] = {
             "robotmode": lambda: f"Robotmode: {controller.robot_mode.name}",
@@ -57,7 +54,7 @@ class DashboardServer:
             "close popup": lambda: "closing popup",
             "close safety popup": lambda: "closing safety popup",
         }
-        self._server = TcpServer(host, {DASHBOARD_PORT: self._serve}, beyond_loopback)
+        self._server = TcpServer(host, {DASHBOARD_PORT: self._serve})
 
     def drop_connections(self) -> None:
         """Cuts all connections; clients may come again."""

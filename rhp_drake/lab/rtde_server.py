@@ -7,10 +7,11 @@ does not simulate, a current for example or the tool's pose, is 0.
 import asyncio
 import enum
 import logging
-import random
 import re
 import struct
 from typing import Final
+
+import numpy as np
 
 from rhp_drake.lab.controller import Controller
 from rhp_drake.lab.rtde_packets import (
@@ -67,14 +68,14 @@ class RtdeServer:
     Args:
         controller: Whose interface this is.
         host: Address to listen at, of loopback.
-        beyond_loopback: Whether it may be one that others can reach.
+        random: What faults draw from, in the server's thread.
 
     Raises:
         InputError: If it cannot listen there.
     """
 
     def __init__(
-        self, controller: Controller, host: str, beyond_loopback: bool = False
+        self, controller: Controller, host: str, random: np.random.Generator
     ) -> None:
         self.stream = Stream.LIVE
         self.delay = 0.0
@@ -83,11 +84,9 @@ class RtdeServer:
         self._clients: list[_Client] = []
         self._ticks = 0
         self._sent_at = 0.0
-        self._random = random.Random(0)
+        self._random = random
         self._server = TcpServer(
-            host,
-            {RTDE_PORT: self._serve_rtde, SCRIPT_PORT: self._take_programs},
-            beyond_loopback,
+            host, {RTDE_PORT: self._serve_rtde, SCRIPT_PORT: self._take_programs}
         )
 
     def publish(self) -> None:
@@ -244,7 +243,7 @@ class _Client:
         outputs: dict[str, Value],
         ticks: int,
         stream: Stream,
-        generator: random.Random,
+        generator: np.random.Generator,
     ) -> None:
         """Makes the frame of a tick, or what a fault makes of it."""
         self._due = self.started and ticks % self._every == 0
@@ -255,7 +254,7 @@ class _Client:
         elif stream != Stream.REPEATING or not self._frame:
             payload = self.outputs.pack(outputs)
             if stream == Stream.CORRUPT:
-                payload = payload[:1] + generator.randbytes(len(payload) - 1)
+                payload = payload[:1] + generator.bytes(len(payload) - 1)
             self._frame = pack_package(PackageType.DATA, payload)
 
     def take_frame(self) -> bytes:

@@ -27,16 +27,13 @@ class TcpServer:
     Args:
         host: Its address, of loopback (127.x.y.z).
         sessions: What to do for a client, by port.
-        beyond_loopback: Whether `host` may be an address that others can reach.
 
     Raises:
         InputError: If the address is not of loopback, or a port is taken.
     """
 
-    def __init__(
-        self, host: str, sessions: Mapping[int, Session], beyond_loopback: bool
-    ) -> None:
-        if not beyond_loopback and not _is_loopback(host):
+    def __init__(self, host: str, sessions: Mapping[int, Session]) -> None:
+        if not _is_loopback(host):
             raise InputError(f"{host}: a virtual lab listens at 127.x.y.z only.")
         self._servers: list[asyncio.Server] = []
         self._writers: dict[asyncio.StreamWriter, int] = {}

@@ -4,6 +4,7 @@ Whoever connects to it cannot tell it from a UR5 and OptiTrack, but for what phy
 leaves out: `rhp run --hardware` talks to it as it talks to a real lab.
 """
 
+from contextlib import ExitStack
 import time
 from typing import TYPE_CHECKING
 
@@ -73,17 +74,21 @@ class VirtualLab:
         self._position.FixValue(self._context, start)
         self._simulator.Initialize()
         self.controller = Controller(start)
-        self.natnet = NatNetServer(random, host, natnet_port)
-        self.rtde = RtdeServer(self.controller, host)
-        self.dashboard = DashboardServer(self.controller, host)
-        self._show_objects()
-        self.natnet.start()
+        of_robot, of_tracker = random.spawn(2)
+        with ExitStack() as stack:
+            self.rtde = RtdeServer(self.controller, host, of_robot)
+            stack.callback(self.rtde.close)
+            self.dashboard = DashboardServer(self.controller, host)
+            stack.callback(self.dashboard.close)
+            self.natnet = NatNetServer(of_tracker, host, natnet_port)
+            stack.callback(self.natnet.stop)
+            self._show_objects()
+            self.natnet.start()
+            self._servers = stack.pop_all()
 
     def close(self) -> None:
         """Ends all servers."""
-        for server in (self.rtde, self.dashboard):
-            server.close()
-        self.natnet.stop()
+        self._servers.close()
 
     def step(self) -> None:
         """One period of the robot's controller, as fast as it can be computed."""
