@@ -134,7 +134,7 @@ def test_run_json_and_recording(rhp, tmp_path, capsys):
     assert code == 1
     printed = capsys.readouterr()
     assert "Meshcat: http://localhost:" in printed.out
-    assert "Time limit: not done after 2.5 simulated seconds." in printed.out
+    assert "Time limit: not done after 2.5 s in the world." in printed.out
     assert printed.err == ""
     assert "<html>" in (tmp_path / "first" / "recording.html").read_text()
     assert sorted(path.name for path in (tmp_path / "first").iterdir()) == [

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import EventStatus
 import pytest
 
 from rhp_drake.closed_loop import Hardware, MakeClosedLoop, MakeStation
@@ -20,6 +21,7 @@ from rhp_drake.scenario import Scenario
 from rhp_drake.station.hardware_station import MeasureStation
 from rhp_drake.station.ports import COMMAND_PERIOD, declared_ports, station_ports
 from rhp_drake.station.ur5_kinematics import hand_pose, inverse_kinematics
+from rhp_drake.systems.meshcat_overlay import MeshcatOverlay
 from rhp_drake.task import Action, hand_targets
 
 HAND = np.array([0.40, 0.0, 0.0])
@@ -205,6 +207,22 @@ def test_meshcat_shows_what_is_measured(hardware):
     simulator.AdvanceTo(0.01)
     for name in ("ur5", "hand", "target", "obstacle_1"):
         assert meshcat.HasPath(f"/drake/visualizer/{name}")
+
+
+def test_goal_regions_are_drawn_where_they_are(hardware, monkeypatch):
+    drawn = []
+
+    def draw_discs(overlay, context):
+        drawn.append(overlay.GetInputPort("goals").Eval(context).copy())
+        return EventStatus.Succeeded()
+
+    monkeypatch.setattr(MeshcatOverlay, "_PublishDiscs", draw_discs)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    loop = MakeClosedLoop(Scenario(), Forward(), meshcat, hardware)
+    goal = np.array([0.7, 0.25])
+    run_on_hardware(Simulator(loop), goal, seed=0, time_limit=0.05)
+    np.testing.assert_allclose(drawn, [[*goal, *BOXES[1:, :2].ravel()]])
 
 
 def test_bad_models(hardware):

@@ -176,7 +176,7 @@ def test_no_search_began(rhp, capsys):
     assert rhp("plan", *options, "--out", "out") == 1
     printed = capsys.readouterr().out
     assert "There is no plan: no search began." in printed
-    assert "Time limit: not done after 0.001 simulated seconds." in printed
+    assert "Time limit: not done after 0.001 s in the world." in printed
 
 
 @pytest.mark.parametrize(

@@ -224,8 +224,8 @@ def say_outcome(console: "Console", run: TaskRun, folder: Path) -> None:
         style="bold green" if outcome.succeeded else "bold red",
     )
     text = (
-        f"{outcome.num_actions} actions, {outcome.time:.1f} s simulated in "
-        f"{run.times['seconds']:.1f} s"
+        f"{outcome.num_actions} actions, {outcome.time:.1f} s in the world, "
+        f"{run.times['seconds']:.1f} s by the clock"
     )
     # Ctrl-C may come before anything was measured.
     if math.isfinite(outcome.target_distance):
