@@ -173,6 +173,7 @@ def MakeClosedLoop(
         builder.Connect(
             planner.GetOutputPort("decision"), overlay.GetInputPort("decision")
         )
+        builder.Connect(robot.fault, overlay.GetInputPort("fault"))
 
     builder.ExportOutput(robot.state, "state")
     builder.ExportOutput(goals.get_output_port(), "goals")

@@ -119,11 +119,13 @@ def run_on_hardware(
     # What begins at the task's beginning, such as the overlay's discs, needs the goals.
     simulator.Initialize()
 
+    fault = diagram.GetOutputPort("fault")
     ticks = 0
 
     def advance(until: float) -> None:
         nonlocal ticks
-        while context.get_time() < until:
+        # After a fault at once: who called ends the drivers, which brake.
+        while context.get_time() < until and fault.Eval(context)[0] == Fault.NONE:
             begin = time.monotonic()
             # Half-way between two commands, so that each stretch has exactly one: the
             # planner's period is no multiple of theirs.
@@ -169,6 +171,8 @@ def _run(
         if guard_fault != Fault.NONE:
             end = "guard_fault"
             message = f"the arm was stopped: {describe(guard_fault)}"
+            # Nothing is published any more by itself.
+            diagram.ForcedPublish(context)
         elif planner_status != Status.RUNNING:
             end = planner_status.name.lower()
             message = diagram.GetOutputPort("message").Eval(context)

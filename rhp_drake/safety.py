@@ -33,6 +33,8 @@ class Fault(enum.IntEnum):
     NOT_RUNNING = 11
     CONNECTION_LOST = 12
     OBJECT_TILTED = 13
+    OBJECT_JUMPED = 14
+    IMPLAUSIBLE_MEASUREMENT = 15
 
 
 _SENTENCES: Final = {
@@ -51,6 +53,9 @@ _SENTENCES: Final = {
     Fault.NOT_RUNNING: "the robot is off, or its program does not run.",
     Fault.CONNECTION_LOST: "the connection to the robot is lost.",
     Fault.OBJECT_TILTED: "an object does not stand upright.",
+    Fault.OBJECT_JUMPED: "an object is suddenly elsewhere: somebody moved it, or the "
+    "tracker takes one for another.",
+    Fault.IMPLAUSIBLE_MEASUREMENT: "the robot tells what cannot be.",
 }
 
 

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 # s between frames: four periods of the robot's commands, eight steps of the physics.
 FRAME_PERIOD: Final = 0.032
+# The background's colors, at the top and at the bottom.
+SKY: Final = ([0.93, 0.95, 0.97], [0.72, 0.76, 0.80])
 
 
 @dataclass
@@ -48,8 +50,7 @@ def MakeMeshcat(config: VisualizationConfig) -> "Meshcat":
         raise InputError(f"visualization: {error}") from None
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
-    meshcat.SetProperty("/Background", "bottom_color", [0.72, 0.76, 0.80])
+    set_sky(meshcat, SKY)
     # One lamp's shadows tell how far things are from the table.
     lamp = "/Lights/PointLightNegativeX/<object>"
     meshcat.SetProperty(lamp, "castShadow", True)
@@ -58,6 +59,22 @@ def MakeMeshcat(config: VisualizationConfig) -> "Meshcat":
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "zoom", 2.1)
     meshcat.SetCameraPose(config.camera, config.camera_target)
     return meshcat
+
+
+def set_sky(
+    meshcat: "Meshcat",
+    colors: tuple[list[float], list[float]],
+    time: float | None = None,
+) -> None:
+    """Colors the background.
+
+    Args:
+        meshcat: Its.
+        colors: At the top and at the bottom; red, green and blue, 0 to 1.
+        time: In a recording, s; None if that need not know.
+    """
+    for side, color in zip(("top_color", "bottom_color"), colors, strict=True):
+        meshcat.SetProperty("/Background", side, color, time)
 
 
 def draw_bands(

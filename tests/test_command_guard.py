@@ -200,24 +200,22 @@ def test_bad_config(config):
 @pytest.mark.parametrize(
     ("known", "expected"),
     [
-        ({"arm_age": 0.11}, Fault.STALE_MEASUREMENT),
+        ({"arm_age": 0.061}, Fault.STALE_MEASUREMENT),
         ({"arm_age": math.nan}, Fault.STALE_MEASUREMENT),
-        ({"object_ages": (0.0, 0.51)}, Fault.STALE_POSE),
+        ({"object_ages": (0.0, 0.061)}, Fault.STALE_POSE),
         ({"object_ages": (math.inf, 0.0)}, Fault.STALE_POSE),
         ({"object_ages": (0.0, math.nan)}, Fault.STALE_POSE),
         ({"arm_fault": Fault.PROTECTIVE_STOP}, Fault.PROTECTIVE_STOP),
         ({"roll_deg": 16.0}, Fault.OBJECT_TILTED),
         ({"roll_deg": -90.0}, Fault.OBJECT_TILTED),
         ({"roll_deg": 90.0, "object_ages": (0.0, 1.0)}, Fault.STALE_POSE),
+        ({"x": 0.531}, Fault.OBJECT_JUMPED),
         ({"arm_fault": Fault.CONNECTION_LOST}, Fault.CONNECTION_LOST),
     ],
 )
 def test_old_measurements_and_faults_of_the_robot_stop_the_arm(known, expected):
     dut = Bench()
-    dut.know(arm_age=0.09, object_ages=(0.49, 0.0), roll_deg=14.0)
-    assert dut.tick(START)[1] == Fault.NONE
-    # It falls off the table.
-    dut.know(roll_deg=60.0, x=0.95)
+    dut.know(arm_age=0.059, object_ages=(0.059, 0.0), roll_deg=14.0)
     assert dut.tick(START)[1] == Fault.NONE
     dut.know(**known)
     moved = np.add(START, [SMALL, 0, 0, 0, 0, 0])
@@ -227,6 +225,25 @@ def test_old_measurements_and_faults_of_the_robot_stop_the_arm(known, expected):
     # It stays so when all is well again.
     dut.know()
     assert dut.tick(START)[1] == expected
+
+
+def test_objects_may_be_pushed_and_fall_off_the_table():
+    dut = Bench()
+    for x in np.arange(0.5, 0.9, 0.029):
+        dut.know(x=x)
+        assert dut.tick(START)[1] == Fault.NONE
+    dut.know(roll_deg=60.0, x=0.95)
+    assert dut.tick(START)[1] == Fault.NONE
+
+
+def test_two_objects_that_change_places_stop_the_arm():
+    dut = Bench()
+    assert dut.tick(START)[1] == Fault.NONE
+    poses = [RigidTransform([0.5, 0.0, 0.03]), RigidTransform([0.5, 0.2, 0.03])]
+    dut.guard.GetInputPort("object_poses").FixValue(
+        dut.context, AbstractValue.Make(poses)
+    )
+    assert dut.tick(START)[1] == Fault.OBJECT_JUMPED
 
 
 @pytest.mark.parametrize(

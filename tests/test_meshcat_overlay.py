@@ -7,6 +7,7 @@ from rhp_drake.commands.tree_drawing import TreeDrawing
 from rhp_drake.planning.policy import Decision
 from rhp_drake.planning.search import Growth
 from rhp_drake.random_streams import stream
+from rhp_drake.safety import Fault, describe
 from rhp_drake.systems.meshcat_overlay import MeshcatOverlay
 from rhp_drake.systems.receding_horizon_planner import NO_DECISION, DecisionRecord
 from rhp_drake.visualization import _bands
@@ -19,6 +20,8 @@ class FakeMeshcat:
         self.paths = set()
         self.visible = {}
         self.num_faces = {}
+        self.buttons = set()
+        self.sky = {}
 
     def Delete(self, path):
         self.paths = {p for p in self.paths if not p.startswith(path)}
@@ -37,8 +40,19 @@ class FakeMeshcat:
         self.num_faces[path] = faces.shape[1]
 
     def SetProperty(self, path, name, value, time_in_recording):
+        if path == "/Background":
+            self.sky[name] = value
+            return
         assert name == "visible"
         self.visible.setdefault(path, {})[time_in_recording] = value
+
+    def AddButton(self, name):
+        assert name not in self.buttons
+        self.buttons.add(name)
+
+    def DeleteButton(self, name, strict):
+        assert not strict
+        self.buttons.discard(name)
 
     def HasPath(self, path):
         return any(p == path or p.startswith(path + "/") for p in self.paths)
@@ -61,11 +75,14 @@ def record(instance, index: int, num_roll_outs: int) -> DecisionRecord:
     return DecisionRecord(index, 0.0, instance.initial_state, decision, 1.0, 0.1)
 
 
-def publish(overlay, instance, time, decision_record, initialize=False):
+def publish(
+    overlay, instance, time, decision_record, initialize=False, fault=Fault.NONE
+):
     context = overlay.CreateDefaultContext()
     context.SetTime(time)
     overlay.GetInputPort("state").FixValue(context, instance.initial_state)
     overlay.GetInputPort("goals").FixValue(context, instance.goals.ravel())
+    overlay.GetInputPort("fault").FixValue(context, [float(fault)])
     value = overlay.GetInputPort("decision").Allocate()
     value.set_value(decision_record)
     overlay.GetInputPort("decision").FixValue(context, value)
@@ -106,6 +123,23 @@ def test_discs_and_roll_outs(instance):
 
     publish(overlay, instance, 0.0, NO_DECISION, initialize=True)
     assert meshcat.paths == discs
+
+
+def test_a_fault_is_shown_until_the_next_run(instance):
+    meshcat = FakeMeshcat()
+    overlay = MeshcatOverlay(meshcat, 3)
+    publish(overlay, instance, 0.0, NO_DECISION, initialize=True)
+    well = dict(meshcat.sky)
+    for time in (0.5, 0.6):
+        publish(overlay, instance, time, NO_DECISION, fault=Fault.STALE_POSE)
+    assert meshcat.buttons == {"STOPPED: an object has not been seen for too long."}
+    assert "/overlay/fault" in meshcat.paths
+    assert meshcat.visible["/overlay/fault"] == {0.0: False, 0.5: True}
+    assert meshcat.sky != well
+    publish(overlay, instance, 0.0, NO_DECISION, initialize=True)
+    assert not meshcat.buttons
+    assert "/overlay/fault" not in meshcat.paths
+    assert meshcat.sky == well
 
 
 def grow(state, tree, *, hand=0.0, target=0.0, count=1) -> Growth:
@@ -152,6 +186,7 @@ def test_real_meshcat(instance):
     meshcat.StartRecording()
     publish(overlay, instance, 0.0, record(instance, 0, 2), initialize=True)
     publish(overlay, instance, 0.1, record(instance, 1, 2))
+    publish(overlay, instance, 0.2, record(instance, 1, 2), fault=Fault.HAND_OUTSIDE)
     drawing = TreeDrawing(meshcat)
     drawing.begin_search()
     drawing.add(grow(instance.initial_state, 1, hand=0.05, target=0.05))
@@ -161,6 +196,8 @@ def test_real_meshcat(instance):
     assert meshcat.HasPath("/overlay/tree/1/1/target")
     assert meshcat.HasPath("/overlay/goal/2/reached")
     assert meshcat.HasPath("/overlay/roll_outs/1/0/hand")
+    assert meshcat.HasPath("/overlay/fault")
+    assert meshcat.DeleteButton(f"STOPPED: {describe(Fault.HAND_OUTSIDE)}")
     assert "<html>" in meshcat.StaticHtml()
 
 

@@ -71,11 +71,16 @@ class Bench:
         self.simulator.AdvanceTo((self.ticks - 0.5) * PLANNER_PERIOD)
         return self.status
 
-    def run(self, ticks=1000):
+    def act(self, state):
+        """The planner decides, and at the next tick, nothing having moved, acts."""
+        self.tick(state)
+        return self.tick(state)
+
+    def run(self, actions=1000):
         """A hand that is at its target at once; the decisions until the end."""
         records = []
-        for _ in range(ticks):
-            self.tick(np.concatenate([self.hand_target, OBJECTS]))
+        for _ in range(actions):
+            self.act(np.concatenate([self.hand_target, OBJECTS]))
             if self.status != Status.RUNNING:
                 break
             records.append(self.decision)
@@ -112,7 +117,7 @@ def test_before_the_first_decision():
 def test_decides_and_records():
     bench = Bench(Script(Action.LEFT, Action.CLOCKWISE))
     bench.tick(STATE, at_rest=False)
-    bench.tick(STATE)
+    bench.act(STATE)
     target = hand_targets(STATE, np.array(Action.LEFT))
     np.testing.assert_array_equal(bench.hand_target, target)
     record = bench.decision
@@ -124,7 +129,7 @@ def test_decides_and_records():
 
     # The hand arrived, not quite: the next action starts from where it is.
     arrived = np.concatenate([np.add(target, [0.001, 0.0, 0.001]), OBJECTS])
-    bench.tick(arrived)
+    bench.act(arrived)
     np.testing.assert_array_equal(
         bench.hand_target, hand_targets(arrived, np.array(Action.CLOCKWISE))
     )
@@ -137,7 +142,7 @@ def test_decides_and_records():
 
 def test_waits_for_the_hand_and_for_rest():
     bench = Bench(Script(Action.FORWARD, Action.FORWARD))
-    bench.tick(STATE)
+    bench.act(STATE)
     target = bench.hand_target
     there = np.concatenate([target, OBJECTS])
     nearly = there + np.eye(9)[0] * 1.1 * ARRIVAL_DISTANCE
@@ -145,13 +150,36 @@ def test_waits_for_the_hand_and_for_rest():
         assert bench.tick(state, at_rest) == Status.RUNNING
         assert bench.decision.index == 0
         np.testing.assert_array_equal(bench.hand_target, target)
-    bench.tick(there)
+    bench.act(there)
     assert bench.decision.index == 1
+
+
+def test_decides_anew_where_the_scene_changed_while_the_policy_thought():
+    bench = Bench(Script(Action.FORWARD))
+    bench.tick(STATE)
+    moved, turned = STATE.copy(), STATE.copy()
+    moved[3] += 0.003
+    turned[8] += 0.03
+    for state in (moved, turned, STATE):
+        bench.tick(state)
+        assert bench.decision.index == -1
+        np.testing.assert_array_equal(bench.hand_target, HAND)
+    # In motion, too, what was thought is forgotten.
+    bench.tick(STATE, at_rest=False)
+    bench.tick(STATE)
+    assert bench.decision.index == -1
+    almost = STATE + 0.001
+    bench.tick(almost)
+    assert bench.decision.index == 0
+    np.testing.assert_array_equal(bench.decision.state, STATE)
+    np.testing.assert_array_equal(
+        bench.hand_target, hand_targets(almost, np.array(Action.FORWARD))
+    )
 
 
 def test_success_ends_the_episode():
     bench = Bench(Script(Action.LEFT, Action.RIGHT))
-    assert bench.tick(STATE) == Status.RUNNING
+    assert bench.act(STATE) == Status.RUNNING
     target = bench.hand_target
     solved = np.concatenate([target, SOLVED[3:]])
     assert bench.tick(solved, at_rest=False) == Status.RUNNING
@@ -174,7 +202,7 @@ def test_out_of_actions():
 def test_success_with_the_last_action_counts():
     turns = [Action.COUNTERCLOCKWISE, Action.CLOCKWISE] * MAX_ACTIONS
     bench = Bench(Script(*turns))
-    assert len(bench.run(ticks=MAX_ACTIONS)) == MAX_ACTIONS
+    assert len(bench.run(actions=MAX_ACTIONS)) == MAX_ACTIONS
     solved = np.concatenate([bench.hand_target, SOLVED[3:]])
     assert bench.tick(solved) == Status.SUCCEEDED
 
@@ -205,7 +233,7 @@ def test_action_out_of_the_workspace_is_refused():
 
 def test_state_not_finite():
     bench = Bench(Script(Action.FORWARD))
-    bench.tick(STATE)
+    bench.act(STATE)
     target = bench.hand_target
     bad = STATE.copy()
     bad[7] = math.nan
@@ -217,7 +245,7 @@ def test_state_not_finite():
 def test_hand_does_not_arrive():
     bench = Bench(Script(Action.FORWARD))
     patience = round(PATIENCE / PLANNER_PERIOD)
-    bench.tick(STATE)
+    bench.act(STATE)
     for _ in range(patience - 1):
         assert bench.tick(STATE) == Status.RUNNING
     bench.tick(STATE)
@@ -243,7 +271,7 @@ def test_same_seed_same_decisions():
 
 
 def test_each_decision_has_its_own_stream():
-    for record in Bench(Dice(), seed=MAX_SEED).run(ticks=3):
+    for record in Bench(Dice(), seed=MAX_SEED).run(actions=3):
         generator = stream(MAX_SEED, "decision", record.index)
         expected = Dice().decide(record.state, GOALS, generator)
         assert record.decision.action == expected.action

@@ -7,6 +7,7 @@ from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Shape
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from rhp_drake.physics import CYLINDER, ObjectPhysics
+from rhp_drake.safety import Fault
 from rhp_drake.systems.meshcat_overlay import (
     HAND_COLOR,
     OBSTACLE_COLOR,
@@ -141,6 +142,7 @@ def _record_goals(meshcat: Meshcat, states: np.ndarray, goals: np.ndarray) -> No
     overlay = MeshcatOverlay(meshcat, len(goals))
     context = overlay.CreateDefaultContext()
     overlay.GetInputPort("goals").FixValue(context, goals.ravel())
+    overlay.GetInputPort("fault").FixValue(context, [float(Fault.NONE)])
     decision = overlay.GetInputPort("decision")
     no_decision = decision.Allocate()
     no_decision.set_value(NO_DECISION)

@@ -25,6 +25,9 @@ from rhp_drake.task import (
 _LEAST_UPRIGHT: Final = math.cos(math.radians(2))
 # An object's: far more than a tracker errs by.  What looks ahead knows none that lie.
 _LEAST_STANDING: Final = math.cos(math.radians(15))
+# m from tick to tick.  A pushed object goes 1 mm; two that a tracker takes for each
+# other are at least a box's side apart, 6 cm.
+_LONGEST_JUMP: Final = 0.03
 
 
 @dataclass
@@ -40,8 +43,8 @@ class CommandGuardConfig(JointLimits):
 
     workspace_margin: float = 0.02
     height_tolerance: float = 0.004
-    object_age_limit: float = 0.5
-    arm_age_limit: float = 0.1
+    object_age_limit: float = 0.06
+    arm_age_limit: float = 0.06
 
     def validate(self) -> None:
         """Raises an InputError if a limit is not positive."""
@@ -61,10 +64,10 @@ class CommandGuard(LeafSystem):
     """Passes joint commands on as long as they are safe.
 
     At each tick the desired position becomes the command, unless it breaks a limit of
-    the configuration, a measurement is too old, or the robot has a fault of its own.
-    Then the last command is held, and the fault stays until the simulator is
-    initialized again.  The command starts as the measured position, so that a first
-    desired position far away is refused, too.
+    the configuration, a measurement is too old, an object is tipped or elsewhere at
+    once, or the robot has a fault of its own.  Then the last command is held, and the
+    fault stays until the simulator is initialized again.  The command starts as the
+    measured position, so that a first desired position far away is refused, too.
 
     Initialization raises a RuntimeError if the measured position is not finite: there
     is nothing safe to command.  Before initialization the command is nan.
@@ -112,9 +115,12 @@ class CommandGuard(LeafSystem):
         )
         position = self.DeclareDiscreteState(np.full(NUM_JOINTS, np.nan))
         fault = self.DeclareDiscreteState(np.array([float(Fault.NONE)]))
+        # Where the objects were at the last tick: (x, y) of each, m in W.
+        objects = self.DeclareDiscreteState(np.full(2 * num_objects, np.nan))
         self.DeclareStateOutputPort(name="position", state_index=position)
         self.DeclareStateOutputPort(name="fault", state_index=fault)
         self._position, self._fault = int(position), int(fault)
+        self._objects = int(objects)
         self.DeclareInitializationDiscreteUpdateEvent(update=self._Initialize)
         self.DeclarePeriodicDiscreteUpdateEvent(
             period_sec=COMMAND_PERIOD, offset_sec=0.0, update=self._Update
@@ -124,6 +130,12 @@ class CommandGuard(LeafSystem):
         measured = latch_position(self._measured_port, context)
         discrete_state.set_value(self._position, measured)
         discrete_state.set_value(self._fault, np.array([float(Fault.NONE)]))
+        discrete_state.set_value(self._objects, self._EvalObjects(context).ravel())
+
+    def _EvalObjects(self, context: Context) -> np.ndarray:
+        """Where the objects are, shape (m, 2), m in W."""
+        poses = self._object_poses_port.Eval(context)
+        return np.array([X_WB.translation()[:2] for X_WB in poses])
 
     def _Update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if context.get_discrete_state(self._fault).value()[0] != Fault.NONE:
@@ -142,6 +154,7 @@ class CommandGuard(LeafSystem):
             fault = self._CheckHand(desired)
         if fault == Fault.NONE:
             discrete_state.set_value(self._position, desired)
+            discrete_state.set_value(self._objects, self._EvalObjects(context).ravel())
         else:
             discrete_state.set_value(self._fault, np.array([float(fault)]))
 
@@ -156,12 +169,22 @@ class CommandGuard(LeafSystem):
         ages = self._object_ages_port.Eval(context)
         if not (ages <= self._config.object_age_limit).all():
             return Fault.STALE_POSE
-        for X_WB in self._object_poses_port.Eval(context):
-            # Beyond the table's edge it falls, which is for the planner to see.
-            x, y, _ = X_WB.translation()
-            on_table = ((x, y) >= TABLE_LOWER).all() and ((x, y) <= TABLE_UPPER).all()
-            if on_table and X_WB.rotation().matrix()[2, 2] < _LEAST_STANDING:
-                return Fault.OBJECT_TILTED
+        positions = self._EvalObjects(context)
+        before = context.get_discrete_state(self._objects).value().reshape(-1, 2)
+        jumps = np.linalg.norm(positions - before, axis=1)
+        # Beyond the table's edge it falls, which is for the planner to see.
+        inside = (positions >= TABLE_LOWER) & (positions <= TABLE_UPPER)
+        on_table = inside.all(axis=1)
+        if (on_table & (jumps > _LONGEST_JUMP)).any():
+            return Fault.OBJECT_JUMPED
+        upright = np.array(
+            [
+                X_WB.rotation().matrix()[2, 2]
+                for X_WB in self._object_poses_port.Eval(context)
+            ]
+        )
+        if (on_table & (upright < _LEAST_STANDING)).any():
+            return Fault.OBJECT_TILTED
         return Fault.NONE
 
     def _CheckHand(self, desired: np.ndarray) -> Fault:

@@ -1,4 +1,4 @@
-"""Draws the task and the planner's thoughts on the table, in Meshcat."""
+"""Draws the task, the planner's thoughts and faults in Meshcat."""
 
 from typing import TYPE_CHECKING, Final
 
@@ -9,8 +9,9 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from rhp_drake import task
+from rhp_drake.safety import Fault, describe
 from rhp_drake.systems.receding_horizon_planner import NO_DECISION
-from rhp_drake.visualization import FRAME_PERIOD, draw_bands
+from rhp_drake.visualization import FRAME_PERIOD, SKY, draw_bands, set_sky
 
 if TYPE_CHECKING:
     from rhp_drake.planning.policy import Decision
@@ -28,6 +29,10 @@ _PATH_HEIGHT: Final = 0.003
 _BEST_HEIGHT: Final = 0.004
 _PATH_WIDTH: Final = 0.004
 _BEST_WIDTH: Final = 0.010
+# After a fault: a frame around the workspace, and the sky.
+FAULT_COLOR: Final = (0.85, 0.05, 0.05)
+_FRAME_WIDTH: Final = 0.02
+_FAULT_SKY: Final = ([1.0, 0.80, 0.78], [0.85, 0.45, 0.42])
 
 
 class MeshcatOverlay(LeafSystem):
@@ -36,6 +41,9 @@ class MeshcatOverlay(LeafSystem):
     A disc is green for the target, red for an obstacle, and stronger while its object
     is inside.  Of each roll-out the hand's path is blue and the target's green; the
     roll-out with the highest return is drawn wide and dark.
+
+    After a fault the workspace has a red frame and the background is red, and among
+    Meshcat's controls stands why, on a button that does nothing.
 
     Recordings keep properties but no new objects.  So each decision gets objects of
     its own, under a path with its number, and only their visibility changes in time.
@@ -47,9 +55,10 @@ class MeshcatOverlay(LeafSystem):
         - state
         - goals
         - decision
+        - fault
 
     `state` has size 3 + 3 m and `goals` 2 m, see `rhp_drake.task`; `decision` is a
-    DecisionRecord, see `RecedingHorizonPlanner`.
+    DecisionRecord, see `RecedingHorizonPlanner`; `fault` has size 1, a `safety.Fault`.
 
     Args:
         meshcat: Where to draw.
@@ -64,6 +73,7 @@ class MeshcatOverlay(LeafSystem):
         self._decision = self.DeclareAbstractInputPort(
             "decision", AbstractValue.Make(NO_DECISION)
         )
+        self._fault = self.DeclareVectorInputPort("fault", 1)
         self.DeclareInitializationPublishEvent(self._PublishDiscs)
         self.DeclarePeriodicPublishEvent(FRAME_PERIOD, 0.0, self._PublishChanges)
         self.DeclareForcedPublishEvent(self._PublishChanges)
@@ -71,6 +81,9 @@ class MeshcatOverlay(LeafSystem):
     def _PublishDiscs(self, context: Context) -> EventStatus:
         """Draws the goal regions, and forgets the roll-outs of the run before."""
         self._meshcat.Delete(PATH)
+        for fault in Fault:
+            self._meshcat.DeleteButton(_label(fault), strict=False)
+        set_sky(self._meshcat, SKY, context.get_time())
         goals = self._goals.Eval(context).reshape(-1, 2)
         disc = Cylinder(task.GOAL_RADIUS, _DISC_THICKNESS)
         for i, goal in enumerate(goals):
@@ -103,7 +116,28 @@ class MeshcatOverlay(LeafSystem):
         # Meshcat itself remembers what is drawn, so this system needs no state.
         if record.index >= 0 and not self._meshcat.HasPath(_path(record.index)):
             self._ShowRollOuts(record.index, record.decision, time)
+        fault = Fault(int(self._fault.Eval(context)[0]))
+        if fault != Fault.NONE and not self._meshcat.HasPath(_FAULT_PATH):
+            self._ShowFault(fault, time)
         return EventStatus.Succeeded()
+
+    def _ShowFault(self, fault: Fault, time: float) -> None:
+        """Shows that the arm was stopped, and why."""
+        (left, front), (right, back) = task.WORKSPACE_LOWER, task.WORKSPACE_UPPER
+        corners = np.array([[left, front], [right, front], [right, back], [left, back]])
+        draw_bands(
+            self._meshcat,
+            _FAULT_PATH,
+            corners,
+            np.roll(corners, -1, axis=0),
+            np.array(FAULT_COLOR),
+            _FRAME_WIDTH,
+            _BEST_HEIGHT,
+        )
+        self._meshcat.SetProperty(_FAULT_PATH, "visible", False, 0.0)
+        self._meshcat.SetProperty(_FAULT_PATH, "visible", True, time)
+        set_sky(self._meshcat, _FAULT_SKY, time)
+        self._meshcat.AddButton(_label(fault))
 
     def _ShowRollOuts(self, index: int, decision: "Decision", time: float) -> None:
         """Draws the roll-outs of decision number `index`, and hides those before."""
@@ -140,6 +174,13 @@ class MeshcatOverlay(LeafSystem):
         if not best:
             color = color + _PALE * (1 - color)
         draw_bands(self._meshcat, path, points[:-1], points[1:], color, width, height)
+
+
+_FAULT_PATH: Final = f"{PATH}/fault"
+
+
+def _label(fault: Fault) -> str:
+    return f"STOPPED: {describe(fault)}"
 
 
 def _disc_path(index: int) -> str:

@@ -29,6 +29,9 @@ ARRIVAL_DISTANCE: Final = 0.002  # m
 ARRIVAL_ANGLE: Final = 0.02  # rad
 # The longest action takes under 2 s.
 PATIENCE: Final = 5.0  # s
+# What may move while the policy thinks, of each body; trackers err by less.
+_UNCHANGED_DISTANCE: Final = 0.002  # m
+_UNCHANGED_ANGLE: Final = 0.02  # rad
 # A parameter of the context is a double; up to here it holds every integer.
 MAX_SEED: Final = 2**53
 
@@ -37,6 +40,16 @@ def has_arrived(hand: np.ndarray, target: np.ndarray) -> bool:
     """Whether the hand's pose, shape (3,), is the target's, as near as it gets."""
     x, y, angle = np.abs(hand - target)
     return bool(np.hypot(x, y) <= ARRIVAL_DISTANCE and angle <= ARRIVAL_ANGLE)
+
+
+def _unchanged(before: np.ndarray, now: np.ndarray) -> bool:
+    """Whether all bodies of two states, shape (3 + 3 m,), are in the same places."""
+    moved = (now - before).reshape(-1, 3)
+    angles = np.remainder(moved[:, 2] + np.pi, 2 * np.pi) - np.pi
+    return bool(
+        (np.linalg.norm(moved[:, :2], axis=1) <= _UNCHANGED_DISTANCE).all()
+        and (np.abs(angles) <= _UNCHANGED_ANGLE).all()
+    )
 
 
 class Status(enum.IntEnum):
@@ -90,13 +103,15 @@ class _Episode:
         hand_target: Where the hand was sent last, shape (3,).
         sent_time: When, s.
         num_actions: How many actions there were.
-        record: The latest decision, None before the first.
+        record: The latest decision that is executed, None before the first.
+        pending: A decision after it, made a moment ago.
     """
 
     hand_target: np.ndarray
     sent_time: float = 0.0
     num_actions: int = 0
     record: DecisionRecord | None = None
+    pending: DecisionRecord | None = None
     status: Status = Status.RUNNING
     message: str = ""
 
@@ -109,10 +124,13 @@ class RecedingHorizonPlanner(LeafSystem):
     """Asks a policy for an action, waits until it is done, and asks again.
 
     An action is done when the hand has arrived at its target and the scene is at
-    rest.  The episode ends when all objects are at their goals, after `MAX_ACTIONS`
-    actions, when an object has fallen, when the policy fails or the state is not
-    finite, or when an action is not done after `PATIENCE`.  Then the hand's target
-    stays where it is.
+    rest.  A decision is executed at the tick after, if nothing has moved since: a real
+    scene may change while the policy thinks, and then the policy decides anew.
+
+    The episode ends when all objects are at their goals, after `MAX_ACTIONS` actions,
+    when an object has fallen, when the policy fails or the state is not finite, or
+    when an action is not done after `PATIENCE`.  Then the hand's target stays where it
+    is.
 
     The policy's computation takes no simulated time, so results do not depend on the
     computer; `DecisionRecord.milliseconds` tells how long it was.
@@ -248,19 +266,37 @@ class RecedingHorizonPlanner(LeafSystem):
                 f"{1000 * np.hypot(x, y):.1f} mm and {angle:.3f} rad from its target."
             )
             late = context.get_time() - episode.sent_time >= PATIENCE
-            return episode.ended(Status.TIMED_OUT, problem) if late else episode
+            if late:
+                return episode.ended(Status.TIMED_OUT, problem)
+            return replace(episode, pending=None)
+        return self._AtRest(context, episode, state, goals)
+
+    def _AtRest(
+        self, context: Context, episode: _Episode, state: np.ndarray, goals: np.ndarray
+    ) -> _Episode:
+        """The episode after a moment in which an action is done."""
         if goals_reached(state, goals):
             return episode.ended(Status.SUCCEEDED, "all objects are at their goals.")
         if episode.num_actions >= MAX_ACTIONS:
             return episode.ended(
                 Status.OUT_OF_ACTIONS, f"{MAX_ACTIONS} actions did not suffice."
             )
+        pending = episode.pending
+        if pending is not None and _unchanged(pending.state, state):
+            return replace(
+                episode,
+                hand_target=hand_targets(state, np.array(pending.decision.action)),
+                sent_time=context.get_time(),
+                num_actions=pending.index + 1,
+                record=pending,
+                pending=None,
+            )
         return self._Decide(context, episode, state, goals)
 
     def _Decide(
         self, context: Context, episode: _Episode, state: np.ndarray, goals: np.ndarray
     ) -> _Episode:
-        """The episode after one more decision of the policy."""
+        """The episode after one more decision of the policy, which is pending."""
         index = episode.num_actions
         seed = int(context.get_numeric_parameter(self._seed).GetAtIndex(0))
         memory: Any = episode.record.decision.memory if episode.record else None
@@ -280,10 +316,7 @@ class RecedingHorizonPlanner(LeafSystem):
             )
         return replace(
             episode,
-            hand_target=hand_targets(state, np.array(decision.action)),
-            sent_time=context.get_time(),
-            num_actions=index + 1,
-            record=DecisionRecord(
+            pending=DecisionRecord(
                 index=index,
                 time=context.get_time(),
                 state=state.copy(),
