@@ -43,7 +43,7 @@ class IdealArm:
         self.position = position
 
     def read(self):
-        return UrMeasurement(self.position, np.zeros(6), self.fault, self.age, 0, 0.0)
+        return UrMeasurement(self.position, np.zeros(6), self.fault, self.age)
 
 
 class Table:

@@ -99,7 +99,7 @@ def test_it_measures_and_moves_nothing_until_engaged(robot, driver):
     driver.command(measured.position + 1.0, engaged=False)
     time.sleep(0.1)
     assert driver.read().fault == Fault.NONE
-    assert driver.read().cycles == 0
+    assert driver.periods.count == 0
     assert is_at_rest(robot)
 
 
@@ -111,7 +111,7 @@ def test_it_follows(robot, driver):
 
     follow(driver, target, there)
     assert driver.read().fault == Fault.NONE
-    assert driver.read().cycles > 10
+    assert driver.periods.count > 10
     steps = np.abs(np.diff(servo_targets(robot), axis=0))
     assert steps.max() <= 2 * JointLimits().velocity_limit * COMMAND_PERIOD
 

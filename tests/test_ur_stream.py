@@ -8,6 +8,7 @@ import pytest
 from robot_process import START, wait_until
 
 from rhp_drake.drivers import ur_stream
+from rhp_drake.drivers.command_periods import BIN_WIDTH, CommandPeriods
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.lab.modes import RobotMode, RuntimeState, SafetyMode
@@ -72,6 +73,7 @@ class Cycles:
             COMMAND_PERIOD,
             SharedVector(ur_stream.COMMAND_SIZE),
             SharedVector(ur_stream.MEASUREMENT_SIZE),
+            SharedVector(CommandPeriods.SIZE),
         )
         self.stream._control = self.stream._receive = robot
         self.stream._connect = lambda: None
@@ -161,6 +163,49 @@ def test_a_call_that_does_not_return_is_noticed(monkeypatch):
     wait_until(lambda: dut.stream.is_stuck, "the driver to be stuck")
     thread.join()
     assert not dut.stream.is_stuck
+
+
+def test_periods_are_counted():
+    periods = CommandPeriods()
+    assert periods.count == 0
+    assert np.isnan(periods.quantile(0.5))
+    for period in [0.008] * 997 + [0.0091, 0.5, 0.7]:
+        periods.add(period)
+    other = CommandPeriods(periods.vector.copy())
+    assert other.count == 1000
+    assert other.mean == pytest.approx(np.mean([0.008] * 997 + [0.0091, 0.5, 0.7]))
+    assert other.quantile(0.5) == pytest.approx(0.008, abs=1.5 * BIN_WIDTH)
+    assert other.quantile(0.998) == pytest.approx(0.0091, abs=1.5 * BIN_WIDTH)
+    assert other.quantile(0.999) == other.longest == 0.7
+    other.merge(periods)
+    assert (other.count, other.longest) == (2000, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("getActualQ", [0.0] * 5 + [1e300]),
+        ("getActualQ", [np.nan] * 6),
+        ("getActualQd", [-20.0] + [0.0] * 5),
+        ("getRobotMode", 1 << 30),
+        ("getSafetyMode", -7),
+    ],
+)
+def test_a_robot_that_tells_nonsense_gets_nothing_more(name, value, monkeypatch):
+    robot = Robot()
+    dut = Cycles(robot)
+    dut.command(START)
+    monkeypatch.setattr(dut.stream, "_stop_arm", lambda: None)
+    ticks = iter(range(5))
+
+    def stopping():
+        if next(ticks) == 2:
+            setattr(robot, name, lambda: value)
+        return len(robot.sent) > 2 or dut.stream._fault != Fault.NONE
+
+    dut.stream.run(stopping, pytest.fail)
+    assert dut.stream._fault == Fault.IMPLAUSIBLE_MEASUREMENT
+    assert len(robot.sent) == 2
 
 
 def test_who_is_told_to_stop_stops_the_arm():

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from rhp_drake.drivers.natnet_config import NatNetConfig, listed
+from rhp_drake.drivers.realtime import ask_for_realtime
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.errors import InputError, WorkError
 from rhp_drake.workers import follow_parent
@@ -65,6 +66,7 @@ def _make_natnet_doubt_counts() -> None:
 def receive(config: NatNetConfig, vector: SharedVector, answer: Connection) -> None:
     """What the driver's process does, until it is killed."""
     follow_parent()
+    ask_for_realtime()
     _make_natnet_doubt_counts()
     # natnet prints a line for each odd datagram.
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):

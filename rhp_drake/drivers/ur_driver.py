@@ -14,6 +14,7 @@ import weakref
 
 import numpy as np
 
+from rhp_drake.drivers.command_periods import CommandPeriods
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.drivers.ur_stream import (
@@ -38,16 +39,12 @@ class UrMeasurement:
         velocity: Likewise, rad/s.
         fault: Why the arm was stopped, if it was.
         age: Since the robot measured this, s.
-        cycles: How often a position was sent so far.
-        longest_cycle: Longest time between two of them, s.
     """
 
     position: np.ndarray
     velocity: np.ndarray
     fault: Fault
     age: float
-    cycles: int
-    longest_cycle: float
 
 
 class UrDriver:
@@ -73,6 +70,7 @@ class UrDriver:
         self._config = config
         self._commands = SharedVector(COMMAND_SIZE)
         self._measurements = SharedVector(MEASUREMENT_SIZE)
+        self._periods = SharedVector(CommandPeriods.SIZE)
         context = multiprocessing.get_context("spawn")
         self._stopping = context.Event()
         self._problem, self._sender = context.Pipe(duplex=False)
@@ -84,6 +82,7 @@ class UrDriver:
                 command_period,
                 self._commands,
                 self._measurements,
+                self._periods,
                 self._stopping,
                 self._sender,
             ),
@@ -140,15 +139,19 @@ class UrDriver:
         values, stamp = self._measurements.read()
         if np.isnan(stamp):  # Nothing has come yet.
             nan = np.full(NUM_JOINTS, np.nan)
-            return UrMeasurement(nan, nan, Fault.NONE, np.inf, 0, 0.0)
+            return UrMeasurement(nan, nan, Fault.NONE, np.inf)
         position, velocity, rest = np.split(values, [NUM_JOINTS, 2 * NUM_JOINTS])
-        heard_at, fault, cycles, longest_cycle = rest.tolist()
+        heard_at, fault = rest.tolist()
         age = time.monotonic() - heard_at
         if fault == Fault.NONE and not self._process.is_alive():
             fault = Fault.CONNECTION_LOST
-        return UrMeasurement(
-            position, velocity, Fault(int(fault)), age, int(cycles), longest_cycle
-        )
+        return UrMeasurement(position, velocity, Fault(int(fault)), age)
+
+    @property
+    def periods(self) -> CommandPeriods:
+        """The times from one position that was sent to the next, all so far."""
+        values, stamp = self._periods.read()
+        return CommandPeriods() if np.isnan(stamp) else CommandPeriods(values)
 
     def stop(self) -> None:
         """Stops the arm, if it moves, and ends the driver.  May be called again."""

@@ -25,6 +25,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from rhp_drake.drivers.command_periods import CommandPeriods
+from rhp_drake.drivers.realtime import ask_for_realtime
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.safety import Fault, check_command
@@ -35,8 +37,9 @@ NUM_JOINTS: Final = 6
 _UNUSED: Final = 0.5
 # m/s^2 of the tool, since servoStop ends in stopl; ur_rtde's own is 10.
 _DECELERATION: Final = 8.0
-# Hz: the controller stops by itself when it hears less often from us.
-_WATCHDOG_FREQUENCY: Final = 10.0
+# Hz: the controller stops by itself when it hears less often from us, that is after
+# five commands of a CB3 that did not come.
+_WATCHDOG_FREQUENCY: Final = 25.0
 _CB3_PERIOD: Final = 0.008  # s
 _E_SERIES_PERIOD: Final = 0.002  # s
 # A call of the library that takes so long tries to connect anew, for ever.
@@ -46,7 +49,13 @@ _WATCH_PERIOD: Final = 0.1  # s
 _ROBOT_RUNNING: Final = 7
 _SAFETY_NORMAL: Final = (1, 2)  # Normal, reduced.
 _SAFETY_PROTECTIVE: Final = (3, 4)  # Protective stop, recovery.
+_ROBOT_MODES: Final = range(-1, 10)
+_SAFETY_MODES: Final = range(1, 12)
 _PROGRAM_RUNNING: Final = 2
+# No joint of a UR robot turns further (360 degrees and a little), or twice as fast as
+# the fastest does.
+_POSSIBLE_POSITION: Final = 6.5  # rad
+_POSSIBLE_VELOCITY: Final = 12.6  # rad/s
 _VARIABLES: Final = [
     "timestamp",
     "actual_q",
@@ -66,8 +75,8 @@ _OURS: Final = (
 
 # Layout of the shared vectors.
 COMMAND_SIZE: Final = 1 + NUM_JOINTS  # Whether engaged, positions.
-# q, qd, when they came (time.monotonic), fault, cycles, longest cycle.
-MEASUREMENT_SIZE: Final = 2 * NUM_JOINTS + 4
+# q, qd, when they came (time.monotonic), fault.
+MEASUREMENT_SIZE: Final = 2 * NUM_JOINTS + 2
 
 
 def serve(
@@ -75,15 +84,17 @@ def serve(
     command_period: float,
     commands: SharedVector,
     measurements: SharedVector,
+    periods: SharedVector,
     stopping: Event,
     problem: Connection,
 ) -> None:
     """The driver's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ask_for_realtime()
     parent = multiprocessing.parent_process()
     assert parent is not None
 
-    stream = Stream(config, command_period, commands, measurements)
+    stream = Stream(config, command_period, commands, measurements, periods)
 
     def watch() -> None:
         while not wait([parent.sentinel], timeout=_WATCH_PERIOD):
@@ -112,11 +123,13 @@ class Stream:
         command_period: float,
         commands: SharedVector,
         measurements: SharedVector,
+        periods: SharedVector,
     ) -> None:
         self._config = config
         self._command_period = command_period
         self._commands = commands
         self._measurements = measurements
+        self._shared_periods = periods
         self._fault = Fault.NONE
         self._receive: Any = None
         self._control: Any = None
@@ -135,8 +148,7 @@ class Stream:
         self._refused = False
         # How much later than due the newest command may have come, s.
         self._slack = command_period
-        self._cycles = 0
-        self._longest_cycle = 0.0
+        self._periods = CommandPeriods()
         self._sent_at = np.nan
         # When the call of the library began that has not returned, s; else inf.
         self._calling_since = np.inf
@@ -171,7 +183,7 @@ class Stream:
                     timestamp, heard_at = self._receive.getTimestamp(), now
                 position = np.array(self._receive.getActualQ())
                 velocity = np.array(self._receive.getActualQd())
-                fault = self._check_robot(now - heard_at)
+                fault = self._check_robot(now - heard_at, position, velocity)
                 if fault == self._fault == Fault.NONE:
                     self._calling_since = now
                     fault = self._follow(position, now)
@@ -191,7 +203,7 @@ class Stream:
             if self._config.dry_run and self._accepted is not None:
                 position = self._accepted
             # A frozen stream looks old, whatever is read from it.
-            rest = [heard_at, self._fault, self._cycles, self._longest_cycle]
+            rest = [heard_at, self._fault]
             self._measurements.write(np.concatenate([position, velocity, rest]))
             # After it was told: to stop takes a while.
             if new_fault:
@@ -224,7 +236,9 @@ class Stream:
             if not self._control.setWatchdog(_WATCHDOG_FREQUENCY):
                 raise RuntimeError("it did not take the watchdog")
 
-    def _check_robot(self, age: float) -> Fault:
+    def _check_robot(
+        self, age: float, position: np.ndarray, velocity: np.ndarray
+    ) -> Fault:
         """What the robot says of itself, or that it says nothing."""
         receive = self._receive
         # The library has two connections; the control's it makes anew by itself.
@@ -233,13 +247,29 @@ class Stream:
             return Fault.CONNECTION_LOST
         if age > self._config.command_timeout:
             return Fault.STALE_MEASUREMENT
-        safety = receive.getSafetyMode()
+        return self._check_modes(position, velocity)
+
+    def _check_modes(self, position: np.ndarray, velocity: np.ndarray) -> Fault:
+        """What a robot that is heard of says of itself."""
+        receive = self._receive
+        safety, mode = receive.getSafetyMode(), receive.getRobotMode()
+        # Written so that nan is impossible, too.
+        possible = (
+            (np.abs(position) <= _POSSIBLE_POSITION).all()
+            and (np.abs(velocity) <= _POSSIBLE_VELOCITY).all()
+            and safety in _SAFETY_MODES
+            and mode in _ROBOT_MODES
+        )
+        if not possible:
+            return Fault.IMPLAUSIBLE_MEASUREMENT
         if safety in _SAFETY_PROTECTIVE:
             return Fault.PROTECTIVE_STOP
         if safety not in _SAFETY_NORMAL:
             return Fault.EMERGENCY_STOP
-        program_runs = control is None or receive.getRuntimeState() == _PROGRAM_RUNNING
-        if receive.getRobotMode() != _ROBOT_RUNNING or not program_runs:
+        program_runs = (
+            self._control is None or receive.getRuntimeState() == _PROGRAM_RUNNING
+        )
+        if mode != _ROBOT_RUNNING or not program_runs:
             return Fault.NOT_RUNNING
         return Fault.NONE
 
@@ -302,9 +332,9 @@ class Stream:
         assert self._accepted is not None
         assert self._before is not None
         if not np.isnan(self._sent_at):
-            self._longest_cycle = max(self._longest_cycle, now - self._sent_at)
+            self._periods.add(now - self._sent_at)
+            self._shared_periods.write(self._periods.vector)
         self._sent_at = now
-        self._cycles += 1
         # A controller that is faster than the commands gets several points of the line.
         share = (now - self._accepted_at + self._period) / self._command_period
         position = self._before + min(share, 1.0) * (self._accepted - self._before)
