@@ -17,6 +17,7 @@ from rhp_drake.planning.policy import Policy
 from rhp_drake.scenario import Scenario
 from rhp_drake.station.hardware_station import Arm, MakeHardwareStation, Tracker
 from rhp_drake.station.simulated_station import MakeSimulatedStation
+from rhp_drake.station.ur5_kinematics import NOMINAL, Ur5Kinematics
 from rhp_drake.systems.command_guard import CommandGuard
 from rhp_drake.systems.hand_servo import HandServo
 from rhp_drake.systems.receding_horizon_planner import RecedingHorizonPlanner
@@ -33,10 +34,12 @@ class Hardware:
     Attributes:
         arm: The robot's.
         tracker: The tracker's.
+        kinematics: The arm's.
     """
 
     arm: Arm
     tracker: Tracker
+    kinematics: Ur5Kinematics = NOMINAL
 
 
 def MakeStation(
@@ -101,11 +104,14 @@ def AddRobot(
         InputError: If there is no such station.
     """
     m = len(scenario.station.objects)
+    kinematics = NOMINAL if hardware is None else hardware.kinematics
     station = MakeStation(scenario, meshcat, hardware)
     builder.AddNamedSystem("station", station)
-    estimator = builder.AddNamedSystem("state_estimator", StateEstimator(m))
-    servo = builder.AddNamedSystem("hand_servo", HandServo())
-    guard = builder.AddNamedSystem("command_guard", CommandGuard(scenario.guard, m))
+    estimator = builder.AddNamedSystem("state_estimator", StateEstimator(m, kinematics))
+    servo = builder.AddNamedSystem("hand_servo", HandServo(kinematics))
+    guard = builder.AddNamedSystem(
+        "command_guard", CommandGuard(scenario.guard, m, kinematics)
+    )
     for theirs, system, ours in (
         ("ur5.position_measured", estimator, "position_measured"),
         ("ur5.velocity_estimated", estimator, "velocity_estimated"),

@@ -16,6 +16,7 @@ from rhp_drake.errors import InputError
 from rhp_drake.scenario import read_named
 from rhp_drake.station.hardware_station import HardwareConfig
 from rhp_drake.station.ports import COMMAND_PERIOD
+from rhp_drake.station.ur5_kinematics import Ur5Kinematics
 
 
 def load_hardware(path: Path, name: str | None = None) -> HardwareConfig:
@@ -32,6 +33,7 @@ def load_hardware(path: Path, name: str | None = None) -> HardwareConfig:
     config = typed_yaml.merge(node, HardwareConfig(), where)
     try:
         config.ur.validate()
+        Ur5Kinematics(config.kinematics)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return config
@@ -62,4 +64,4 @@ def running_hardware(config: HardwareConfig, num_objects: int) -> Iterator[Hardw
         stack.callback(arm.stop)
         tracker.start()
         arm.start()
-        yield Hardware(arm, tracker)
+        yield Hardware(arm, tracker, Ur5Kinematics(config.kinematics))

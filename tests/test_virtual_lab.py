@@ -123,6 +123,11 @@ def test_bundled_files_are_read(name):
         ("lab: {ur: {hots: 1}}", "hots"),
         ("lab: {ur: {host: ''}}", "lab: ur.host: the robot's address is missing"),
         ("lab: {ur: {host: a, gain: high}}", "gain"),
+        (
+            "lab: {ur: {host: a}, kinematics: {delta_d: [0.1, 0.2]}}",
+            r"lab: kinematics.delta_d is \[0.1, 0.2\]; it must be six finite numbers",
+        ),
+        ("lab: {kinematics: {delta_a: [0, x, 0, 0, 0, 0]}}", "kinematics.delta_a"),
         ("ur: 3", "expected a lab with its name before it"),
     ],
 )

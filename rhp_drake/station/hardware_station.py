@@ -25,6 +25,7 @@ from rhp_drake.drivers.ur_driver import UrMeasurement
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.station.shown_station import MakeShownStation
 from rhp_drake.station.station_models import StationConfig
+from rhp_drake.station.ur5_kinematics import DhDeltas
 
 
 @dataclass
@@ -34,11 +35,13 @@ class HardwareConfig:
     Attributes:
         description: One sentence for people.
         ur: The robot.
+        kinematics: Its DH parameters, if they are not the nominal ones.
         natnet: The tracker.
     """
 
     description: str = ""
     ur: UrDriverConfig = field(default_factory=UrDriverConfig)
+    kinematics: DhDeltas = field(default_factory=DhDeltas)
     natnet: NatNetConfig = field(default_factory=NatNetConfig)
 
 

@@ -12,7 +12,11 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from rhp_drake.errors import InputError
 from rhp_drake.safety import Fault, JointLimits, check_command
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
-from rhp_drake.station.ur5_kinematics import PUSHING_HEIGHT, forward_kinematics
+from rhp_drake.station.ur5_kinematics import (
+    NOMINAL,
+    PUSHING_HEIGHT,
+    Ur5Kinematics,
+)
 from rhp_drake.systems.latching import latch_position
 from rhp_drake.task import (
     TABLE_LOWER,
@@ -93,12 +97,19 @@ class CommandGuard(LeafSystem):
     Args:
         config: The limits.
         num_objects: m, the target included.
+        kinematics: The arm's.
     """
 
-    def __init__(self, config: CommandGuardConfig, num_objects: int) -> None:
+    def __init__(
+        self,
+        config: CommandGuardConfig,
+        num_objects: int,
+        kinematics: Ur5Kinematics = NOMINAL,
+    ) -> None:
         super().__init__()
         config.validate()
         self._config = config
+        self._kinematics = kinematics
         self._desired_port = self.DeclareVectorInputPort(
             name="position", size=NUM_JOINTS
         )
@@ -189,7 +200,7 @@ class CommandGuard(LeafSystem):
 
     def _CheckHand(self, desired: np.ndarray) -> Fault:
         """Whether a command, shape (6,), has the hand upright where it may be."""
-        X_WH = forward_kinematics(desired)
+        X_WH = self._kinematics.forward_kinematics(desired)
         margin = self._config.workspace_margin
         inside = (
             (X_WH[:2, 3] >= WORKSPACE_LOWER - margin).all()

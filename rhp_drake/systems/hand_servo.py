@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
-from rhp_drake.station.ur5_kinematics import hand_pose, inverse_kinematics
+from rhp_drake.station.ur5_kinematics import NOMINAL, Ur5Kinematics
 from rhp_drake.systems.latching import latch_position
 
 LINEAR_SPEED: Final = 0.12  # m/s, peak
@@ -88,10 +88,14 @@ class HandServo(LeafSystem):
 
     `hand_target` has size 3: the pose (x, y, theta) of H in W, m and rad, theta
     unwrapped.  The positions have size 6 (rad).
+
+    Args:
+        kinematics: The arm's.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, kinematics: Ur5Kinematics = NOMINAL) -> None:
         super().__init__()
+        self._kinematics = kinematics
         self._target_port = self.DeclareVectorInputPort(name="hand_target", size=3)
         self._measured_port = self.DeclareVectorInputPort(
             name="position_measured", size=NUM_JOINTS
@@ -114,7 +118,7 @@ class HandServo(LeafSystem):
     def _Initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = latch_position(self._measured_port, context)
         discrete_state.set_value(self._position, measured)
-        self._Hold(hand_pose(measured), discrete_state)
+        self._Hold(self._kinematics.hand_pose(measured), discrete_state)
 
     def _Hold(self, pose: np.ndarray, discrete_state: DiscreteValues) -> None:
         """Leaves the command as it is; any target then begins a motion from rest."""
@@ -138,7 +142,7 @@ class HandServo(LeafSystem):
         elif clock >= motion.duration:
             discrete_state.set_value(self._velocity, np.zeros(3))
             return
-        step = _next_step(motion, clock, position)
+        step = _next_step(motion, clock, position, self._kinematics)
         if step is None:
             self._Hold(pose, discrete_state)
             return
@@ -155,7 +159,7 @@ class HandServo(LeafSystem):
 
 
 def _next_step(
-    motion: _Motion, clock: float, position: np.ndarray
+    motion: _Motion, clock: float, position: np.ndarray, kinematics: Ur5Kinematics
 ) -> tuple[float, np.ndarray] | None:
     """Goes on along a motion for one period, or less where joints would be too fast.
 
@@ -163,6 +167,7 @@ def _next_step(
         motion: The motion, whose target may be anything.
         clock: The present time within the motion, s.
         position: The present command, shape (6,).
+        kinematics: The arm's.
 
     Returns:
         The next time within the motion and the next command, or None if there is no
@@ -171,11 +176,11 @@ def _next_step(
     time_step = COMMAND_PERIOD
     try:
         # Rather than go as far as possible, stay if the target is out of reach or nan.
-        inverse_kinematics(motion.target)
+        kinematics.inverse_kinematics(motion.target)
         # Joint speeds are almost proportional to the step: two rounds usually do.
         for _ in range(5):
             next_clock = min(clock + time_step, motion.duration)
-            next_position = inverse_kinematics(motion.pose(next_clock))
+            next_position = kinematics.inverse_kinematics(motion.pose(next_clock))
             speed = np.abs(next_position - position).max() / COMMAND_PERIOD
             if speed <= JOINT_SPEED:
                 return next_clock, next_position

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
-from rhp_drake.station.ur5_kinematics import hand_pose
+from rhp_drake.station.ur5_kinematics import NOMINAL, Ur5Kinematics
 
 REST_WINDOW: Final = 0.1  # s
 # What may move within the window.  Twice the noise of a motion-capture system, and
@@ -48,10 +48,12 @@ class StateEstimator(LeafSystem):
 
     Args:
         num_objects: m, the target included.
+        kinematics: The arm's.
     """
 
-    def __init__(self, num_objects: int) -> None:
+    def __init__(self, num_objects: int, kinematics: Ur5Kinematics = NOMINAL) -> None:
         super().__init__()
+        self._kinematics = kinematics
         self._num_objects = num_objects
         size = 3 + 3 * num_objects
         self._position_port = self.DeclareVectorInputPort(
@@ -91,7 +93,8 @@ class StateEstimator(LeafSystem):
             )
         position = self._position_port.Eval(context)
         finite = np.isfinite(position).all()
-        parts = [hand_pose(position) if finite else np.full(3, np.nan)]
+        nowhere = np.full(3, np.nan)
+        parts = [self._kinematics.hand_pose(position) if finite else nowhere]
         for X_WB in poses:
             R_WB = X_WB.rotation().matrix()
             yaw = np.arctan2(R_WB[1, 0], R_WB[0, 0])
