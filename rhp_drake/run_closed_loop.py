@@ -22,6 +22,8 @@ from rhp_drake.systems.receding_horizon_planner import (
 )
 
 SUCCEEDED: Final = Status.SUCCEEDED.name.lower()
+GUARD_FAULT: Final = "guard_fault"
+TIME_LIMIT: Final = "time_limit"
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Outcome:
     """How a run ended.
 
     Attributes:
-        status: The planner's `Status`, in lower case, or "guard_fault", "time_limit".
+        status: The planner's `Status`, in lower case, or `GUARD_FAULT`, `TIME_LIMIT`.
         message: Why it ended, one sentence.
         num_actions: How many actions were executed.
         time: Simulated time, s.
@@ -169,7 +171,7 @@ def _run(
         planner_status = Status(int(status.Eval(context)[0]))
         guard_fault = Fault(int(fault.Eval(context)[0]))
         if guard_fault != Fault.NONE:
-            end = "guard_fault"
+            end = GUARD_FAULT
             message = f"the arm was stopped: {describe(guard_fault)}"
             # Nothing is published any more by itself.
             diagram.ForcedPublish(context)
@@ -177,7 +179,7 @@ def _run(
             end = planner_status.name.lower()
             message = diagram.GetOutputPort("message").Eval(context)
         elif context.get_time() >= time_limit:
-            end = "time_limit"
+            end = TIME_LIMIT
             message = f"not done after {time_limit:g} s in the world."
 
     state = diagram.GetOutputPort("state").Eval(context)

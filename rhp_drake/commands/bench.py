@@ -6,6 +6,7 @@ import typer
 
 from rhp_drake.commands.bench_action_frames import action_frames
 from rhp_drake.commands.bench_dqn import dqn
+from rhp_drake.commands.bench_hardware import faults, loopback
 from rhp_drake.commands.bench_planners import planners
 from rhp_drake.commands.bench_push_model import push_model
 from rhp_drake.commands.bench_reinforcement import reinforcement
@@ -31,6 +32,8 @@ bench.command()(action_frames)
 bench.command()(planners)
 bench.command()(reinforcement)
 bench.command()(dqn)
+bench.command()(loopback)
+bench.command()(faults)
 
 
 @bench.command()

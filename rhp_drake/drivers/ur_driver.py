@@ -24,7 +24,7 @@ from rhp_drake.drivers.ur_stream import (
     serve,
 )
 from rhp_drake.errors import InputError
-from rhp_drake.safety import Fault
+from rhp_drake.safety import Fault, describe
 
 # How long `stop` waits for the arm to brake.
 _STOP_TIME: Final = 2.0  # s
@@ -86,6 +86,7 @@ class UrDriver:
                 self._stopping,
                 self._sender,
             ),
+            name="ur",
             daemon=True,
         )
 
@@ -121,7 +122,8 @@ class UrDriver:
             if self._problem.poll():
                 return str(self._problem.recv()).rstrip("!.")
         except EOFError:
-            return "its driver died"
+            fault = self.read().fault
+            return f"its driver ended: {describe(fault).rstrip('.')}"
         return f"no answer within {self._config.connection_timeout:g} s"
 
     def command(self, position: np.ndarray, engaged: bool) -> None:

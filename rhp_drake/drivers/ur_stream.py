@@ -26,7 +26,7 @@ from typing import Any, Final
 import numpy as np
 
 from rhp_drake.drivers.command_periods import CommandPeriods
-from rhp_drake.drivers.realtime import ask_for_realtime
+from rhp_drake.drivers.realtime import ask_for_realtime, leave_realtime
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.safety import Fault, check_command
@@ -52,6 +52,8 @@ _SAFETY_PROTECTIVE: Final = (3, 4)  # Protective stop, recovery.
 _ROBOT_MODES: Final = range(-1, 10)
 _SAFETY_MODES: Final = range(1, 12)
 _PROGRAM_RUNNING: Final = 2
+# rad from command to command: slower than this is rounding, not motion.
+_STILL: Final = 1e-5
 # No joint of a UR robot turns further (360 degrees and a little), or twice as fast as
 # the fastest does.
 _POSSIBLE_POSITION: Final = 6.5  # rad
@@ -90,7 +92,6 @@ def serve(
 ) -> None:
     """The driver's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    ask_for_realtime()
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -105,7 +106,14 @@ def serve(
 
     Thread(target=watch, daemon=True).start()
     try:
-        stream.run(stopping.is_set, problem.send)
+        try:
+            stream.connect()
+        except (RuntimeError, ValueError) as error:
+            problem.send(str(error))
+            return
+        # Only now: the library waits in loops, until the robot answers.
+        ask_for_realtime()
+        stream.run(stopping.is_set)
     except Exception:
         # Nothing is sent any more, so that the watchdog stops the arm.
         traceback.print_exc()
@@ -158,20 +166,12 @@ class Stream:
         """Whether the library does not return; may be asked from any thread."""
         return time.monotonic() - self._calling_since > _STUCK_TIME
 
-    def run(
-        self, stopping: Callable[[], bool], tell_problem: Callable[[str], None]
-    ) -> None:
+    def run(self, stopping: Callable[[], bool]) -> None:
         """Until told to stop; the first measurement tells that it is connected.
 
         Args:
             stopping: Whether to stop.
-            tell_problem: Called, once, if there is no connection.
         """
-        try:
-            self._connect()
-        except (RuntimeError, ValueError) as error:
-            tell_problem(str(error))
-            return
         timestamp, heard_at = np.nan, time.monotonic()
         cycle = time.monotonic()
         position = velocity = np.full(NUM_JOINTS, np.nan)
@@ -217,7 +217,12 @@ class Stream:
         if self._fault == Fault.NONE:
             self._stop_arm()
 
-    def _connect(self) -> None:
+    def connect(self) -> None:
+        """Connects to the robot, which may then be moved.
+
+        Raises:
+            RuntimeError: If it cannot be used, as a ValueError.
+        """
         from rtde_control import RTDEControlInterface
         from rtde_receive import RTDEReceiveInterface
 
@@ -235,6 +240,8 @@ class Stream:
             self._period = _E_SERIES_PERIOD if is_e_series else _CB3_PERIOD
             if not self._control.setWatchdog(_WATCHDOG_FREQUENCY):
                 raise RuntimeError("it did not take the watchdog")
+            # The first command after another kind of command waits, too.
+            self._control.kickWatchdog()
 
     def _check_robot(
         self, age: float, position: np.ndarray, velocity: np.ndarray
@@ -318,7 +325,9 @@ class Stream:
         if fault == Fault.NONE:
             taken = np.abs(desired - accepted).max() / config.limits.velocity_limit
             self._slack = min(allowed - taken, self._command_period)
-            self._moving = previous is not None and (desired != previous).any()
+            self._moving = (
+                previous is not None and np.abs(desired - previous).max() > _STILL
+            )
             self._before = desired if self._sent is None else self._sent
             self._accepted, self._accepted_at = desired, now
         return fault
@@ -364,6 +373,8 @@ class Stream:
         """
         if self._control is None:
             return
+        # The library waits in a loop until the arm is at rest.
+        leave_realtime()
         try:
             if self._fault == Fault.NONE or self._fault in _OURS:
                 self._control.servoStop(_DECELERATION)
