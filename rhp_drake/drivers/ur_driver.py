@@ -14,6 +14,7 @@ import weakref
 
 import numpy as np
 
+from rhp_drake.drivers.measurements import ArmMeasurement
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.drivers.ur_stream import (
@@ -30,22 +31,14 @@ _STOP_TIME: Final = 2.0  # s
 
 
 @dataclass(frozen=True)
-class UrMeasurement:
+class UrMeasurement(ArmMeasurement):
     """What the driver knows of the robot.
 
     Attributes:
-        position: Of the joints, base to wrist, shape (6,), rad.
-        velocity: Likewise, rad/s.
-        fault: Why the arm was stopped, if it was.
-        age: Since the robot measured this, s.
         cycles: How often a position was sent so far.
         longest_cycle: Longest time between two of them, s.
     """
 
-    position: np.ndarray
-    velocity: np.ndarray
-    fault: Fault
-    age: float
     cycles: int
     longest_cycle: float
 
