@@ -7,6 +7,7 @@ import typer
 from rhp_drake.commands.bench import bench
 from rhp_drake.commands.calibrate import calibrate
 from rhp_drake.commands.demos import demos
+from rhp_drake.commands.driver import driver
 from rhp_drake.commands.evaluate import evaluate
 from rhp_drake.commands.figure4 import figure4
 from rhp_drake.commands.lab import lab
@@ -25,6 +26,7 @@ app = typer.Typer(
 for command in (
     run,
     lab,
+    driver,
     calibrate,
     plan,
     imitate,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rhp_drake import typed_yaml
 from rhp_drake.closed_loop import Hardware
+from rhp_drake.drivers.lcm_driver import LcmDriver
 from rhp_drake.drivers.natnet_driver import NatNetDriver
 from rhp_drake.drivers.ur_driver import UrDriver
 from rhp_drake.errors import InputError
@@ -32,8 +33,11 @@ def load_hardware(path: Path, name: str | None = None) -> HardwareConfig:
     where, _, node = read_named(path, name, "lab")
     config = typed_yaml.merge(node, HardwareConfig(), where)
     try:
-        config.ur.validate()
         Ur5Kinematics(config.kinematics)
+        if config.lcm is not None:
+            config.lcm.validate()
+        else:
+            config.ur.validate()
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return config
@@ -49,19 +53,33 @@ def running_hardware(config: HardwareConfig, num_objects: int) -> Iterator[Hardw
 
     Raises:
         InputError: If the robot cannot be used, or the tracker lacks an object.
-        WorkError: If the tracker does not answer.
+        WorkError: If the tracker, or the driver on the other side of LCM, does not
+            answer.
     """
-    if len(config.natnet.bodies) != num_objects:
-        raise InputError(
-            f"natnet.bodies names {len(config.natnet.bodies)} rigid bodies; the "
-            f"scenario has {num_objects} objects."
-        )
-    tracker = NatNetDriver(config.natnet)
+    kinematics = Ur5Kinematics(config.kinematics)
+    if config.lcm is not None:
+        _check_number("lcm.objects", "objects", config.lcm.objects, num_objects)
+        driver = LcmDriver(config.lcm)
+        with ExitStack() as stack:
+            stack.callback(driver.stop)
+            driver.start()
+            yield Hardware(driver.arm, driver.tracker, kinematics)
+        return
+    _check_number("natnet.bodies", "rigid bodies", config.natnet.bodies, num_objects)
     arm = UrDriver(config.ur, COMMAND_PERIOD)
+    tracker = NatNetDriver(config.natnet)
     with ExitStack() as stack:
         # The arm first, and each even if the other's fails.
         stack.callback(tracker.stop)
         stack.callback(arm.stop)
         tracker.start()
         arm.start()
-        yield Hardware(arm, tracker, Ur5Kinematics(config.kinematics))
+        yield Hardware(arm, tracker, kinematics)
+
+
+def _check_number(key: str, kind: str, names: list[str], num_objects: int) -> None:
+    """Raises an InputError unless there are as many names as objects."""
+    if len(names) != num_objects:
+        raise InputError(
+            f"{key} names {len(names)} {kind}; the scenario has {num_objects} objects."
+        )

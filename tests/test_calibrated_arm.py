@@ -11,8 +11,8 @@ import pytest
 
 from rhp_drake import hardware
 from rhp_drake.closed_loop import AddRobot, Hardware
+from rhp_drake.drivers.measurements import ArmMeasurement
 from rhp_drake.drivers.natnet_driver import TrackedPose
-from rhp_drake.drivers.ur_driver import UrMeasurement
 from rhp_drake.errors import InputError
 from rhp_drake.safety import Fault
 from rhp_drake.scenario import Scenario
@@ -49,7 +49,7 @@ class IdealArm:
         self.position = position
 
     def read(self):
-        return UrMeasurement(self.position, np.zeros(6), Fault.NONE, 0.002, 0, 0.0)
+        return ArmMeasurement(self.position, np.zeros(6), Fault.NONE, 0.002)
 
     @property
     def hand(self):

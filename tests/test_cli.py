@@ -15,6 +15,7 @@ COMMANDS = (
     *(
         "run",
         "lab",
+        "driver",
         "calibrate",
         "plan",
         "demos",

@@ -11,8 +11,8 @@ from pydrake.systems.framework import EventStatus
 import pytest
 
 from rhp_drake.closed_loop import Hardware, MakeClosedLoop, MakeStation
+from rhp_drake.drivers.measurements import ArmMeasurement
 from rhp_drake.drivers.natnet_driver import TrackedPose
-from rhp_drake.drivers.ur_driver import UrMeasurement
 from rhp_drake.errors import InputError
 from rhp_drake.planning.policy import Decision
 from rhp_drake.run_closed_loop import run_on_hardware
@@ -43,7 +43,7 @@ class IdealArm:
         self.position = position
 
     def read(self):
-        return UrMeasurement(self.position, np.zeros(6), self.fault, self.age)
+        return ArmMeasurement(self.position, np.zeros(6), self.fault, self.age)
 
 
 class Table:

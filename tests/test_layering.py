@@ -31,7 +31,7 @@ LAYERS = (
     {"learning", "systems"},
     {"gymnasium_env", "scenario"},
     {"closed_loop"},
-    {"hardware"},
+    {"hardware", "lcm_bridge"},
     {"run_closed_loop"},
     {"lab"},
     {"evaluation", "run_record"},

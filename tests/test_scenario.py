@@ -53,7 +53,7 @@ def error_of(path: Path, *args) -> str:
 
 
 # What `--hardware` takes is there, too.
-LABS = {"hardware", "virtual_lab"}
+LABS = {"hardware", "lcm", "virtual_lab"}
 BUNDLED = sorted(x for x in scenarios_path().glob("*.yaml") if x.stem not in LABS)
 
 

@@ -17,8 +17,8 @@ from pydrake.systems.analysis import Simulator
 
 from rhp_drake.closed_loop import Hardware, MakeClosedLoop
 from rhp_drake.drivers.command_periods import CommandPeriods
-from rhp_drake.drivers.natnet_driver import TrackedPose
-from rhp_drake.drivers.ur_driver import UrDriver, UrMeasurement
+from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
+from rhp_drake.drivers.ur_driver import UrDriver
 from rhp_drake.errors import InputError, WorkError
 from rhp_drake.hardware import running_hardware
 from rhp_drake.planning.policy_config import MakePolicy
@@ -187,7 +187,7 @@ class _WatchedArm:
                 position = np.full_like(position, 10.0)
         self._arm.command(position, engaged)
 
-    def read(self) -> UrMeasurement:
+    def read(self) -> ArmMeasurement:
         """See `Arm`."""
         measured = self._arm.read()
         self._ages.append(measured.age)
@@ -201,7 +201,7 @@ class _WatchedTracker:
         self._tracker = tracker
         self._ages = ages
 
-    def read(self) -> list[TrackedPose]:
+    def read(self) -> list[ObjectPose]:
         """See `Tracker`."""
         poses = self._tracker.read()
         self._ages.append(max(pose.age for pose in poses))

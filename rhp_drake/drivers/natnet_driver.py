@@ -15,6 +15,7 @@ import weakref
 
 import numpy as np
 
+from rhp_drake.drivers.measurements import ObjectPose
 from rhp_drake.drivers.natnet_config import NatNetConfig, PoseConfig, listed
 from rhp_drake.drivers.natnet_receiver import (
     FRAME,
@@ -36,20 +37,16 @@ _SPAWN_TIME: Final = 60.0  # s
 
 
 @dataclass(frozen=True)
-class TrackedPose:
-    """What is known of one box.
+class TrackedPose(ObjectPose):
+    """What is known of one box; its pose is that of the last frame that tracked it.
+
+    Its age also grows when no frames come.
 
     Attributes:
-        X_WB: Its pose in the last frame in which it was tracked; its position is nan
-            if it never was.
-        age: For how long that has been known, s; inf if it never was tracked.  It also
-            grows when no frames come.
         tracked: Whether it was tracked in the last frame that came.
         frame: Motive's number of the frame that X_WB is of; -1 if there is none.
     """
 
-    X_WB: "RigidTransform"
-    age: float
     tracked: bool
     frame: int
 

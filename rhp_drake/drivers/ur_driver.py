@@ -4,7 +4,6 @@
 measurements go through shared memory.
 """
 
-from dataclasses import dataclass
 import multiprocessing
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event
@@ -15,6 +14,7 @@ import weakref
 import numpy as np
 
 from rhp_drake.drivers.command_periods import CommandPeriods
+from rhp_drake.drivers.measurements import ArmMeasurement
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.drivers.ur_stream import (
@@ -28,23 +28,6 @@ from rhp_drake.safety import Fault, describe
 
 # How long `stop` waits for the arm to brake.
 _STOP_TIME: Final = 2.0  # s
-
-
-@dataclass(frozen=True)
-class UrMeasurement:
-    """What the driver knows of the robot.
-
-    Attributes:
-        position: Of the joints, base to wrist, shape (6,), rad.
-        velocity: Likewise, rad/s.
-        fault: Why the arm was stopped, if it was.
-        age: Since the robot measured this, s.
-    """
-
-    position: np.ndarray
-    velocity: np.ndarray
-    fault: Fault
-    age: float
 
 
 class UrDriver:
@@ -136,18 +119,18 @@ class UrDriver:
         """
         self._commands.write(np.concatenate([[float(engaged)], position]))
 
-    def read(self) -> UrMeasurement:
+    def read(self) -> ArmMeasurement:
         """The newest measurement; its numbers are nan before the first."""
         values, stamp = self._measurements.read()
         if np.isnan(stamp):  # Nothing has come yet.
             nan = np.full(NUM_JOINTS, np.nan)
-            return UrMeasurement(nan, nan, Fault.NONE, np.inf)
+            return ArmMeasurement(nan, nan, Fault.NONE, np.inf)
         position, velocity, rest = np.split(values, [NUM_JOINTS, 2 * NUM_JOINTS])
         heard_at, fault = rest.tolist()
         age = time.monotonic() - heard_at
         if fault == Fault.NONE and not self._process.is_alive():
             fault = Fault.CONNECTION_LOST
-        return UrMeasurement(position, velocity, Fault(int(fault)), age)
+        return ArmMeasurement(position, velocity, Fault(int(fault)), age)
 
     @property
     def periods(self) -> CommandPeriods:

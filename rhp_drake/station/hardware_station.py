@@ -1,5 +1,6 @@
 """The hardware station: the ports of the simulated one, with a robot behind them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -18,10 +19,10 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Demultiplexer
 
+from rhp_drake.drivers.lcm_config import LcmConfig
+from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.drivers.natnet_config import NatNetConfig
-from rhp_drake.drivers.natnet_driver import TrackedPose
 from rhp_drake.drivers.ur_config import UrDriverConfig
-from rhp_drake.drivers.ur_driver import UrMeasurement
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.station.shown_station import MakeShownStation
 from rhp_drake.station.station_models import StationConfig
@@ -37,12 +38,15 @@ class HardwareConfig:
         ur: The robot.
         kinematics: Its DH parameters, if they are not the nominal ones.
         natnet: The tracker.
+        lcm: Where a driver of both is reached, if it runs on its own, as `rhp driver`
+            does; `ur` and `natnet` are then its business.
     """
 
     description: str = ""
     ur: UrDriverConfig = field(default_factory=UrDriverConfig)
     kinematics: DhDeltas = field(default_factory=DhDeltas)
     natnet: NatNetConfig = field(default_factory=NatNetConfig)
+    lcm: LcmConfig | None = None
 
 
 class Arm(Protocol):
@@ -52,7 +56,7 @@ class Arm(Protocol):
         """Leaves a command, shape (6,), rad."""
         ...
 
-    def read(self) -> UrMeasurement:
+    def read(self) -> ArmMeasurement:
         """The newest measurement."""
         ...
 
@@ -60,7 +64,7 @@ class Arm(Protocol):
 class Tracker(Protocol):
     """A tracker's driver, e.g. `NatNetDriver`; it never makes anybody wait."""
 
-    def read(self) -> list[TrackedPose]:
+    def read(self) -> Sequence[ObjectPose]:
         """What is known of the objects, in task order."""
         ...
 
@@ -142,7 +146,7 @@ class TrackerInterface(LeafSystem):
         super().__init__()
         self._tracker = tracker
         nowhere = RigidTransform(np.full(3, np.nan))
-        unseen = TrackedPose(nowhere, age=np.inf, tracked=False, frame=-1)
+        unseen = ObjectPose(nowhere, age=np.inf)
         seen = self.DeclareAbstractState(AbstractValue.Make([unseen] * num_objects))
         self._seen = int(seen)
         prerequisites = {self.abstract_state_ticket(seen)}
@@ -160,12 +164,12 @@ class TrackerInterface(LeafSystem):
     def Measure(self, state: State) -> None:
         """Writes what the driver sees now into this system's state."""
         seen = state.get_mutable_abstract_state(self._seen)
-        seen.set_value(self._tracker.read())
+        seen.set_value(list(self._tracker.read()))
 
     def _Update(self, context: Context, state: State) -> None:
         self.Measure(state)
 
-    def _get_seen(self, context: Context) -> list[TrackedPose]:
+    def _get_seen(self, context: Context) -> list[ObjectPose]:
         return context.get_abstract_state(self._seen).get_value()
 
     def _CalcPoses(self, context: Context, output: AbstractValue) -> None:

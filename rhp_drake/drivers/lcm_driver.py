@@ -1,0 +1,204 @@
+"""A robot and a tracker over LCM, for a lab whose driver is a process of its own.
+
+`lcm_receiver` is what receives.  Messages and channels are in docs/hardware.md.
+"""
+
+import math
+import multiprocessing
+from multiprocessing.process import BaseProcess
+import time
+from typing import TYPE_CHECKING, Final
+import weakref
+
+import numpy as np
+
+from rhp_drake.drivers.lcm_config import (
+    COMMAND_CHANNEL,
+    POSES_CHANNEL,
+    STATUS_CHANNEL,
+    LcmConfig,
+)
+from rhp_drake.drivers.lcm_receiver import POSE_SIZE, STATUS_SIZE, receive
+from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
+from rhp_drake.drivers.rhp_lcm import lcmt_ur_command
+from rhp_drake.drivers.shared_memory import SharedVector
+from rhp_drake.errors import WorkError
+from rhp_drake.safety import Fault, describe
+
+if TYPE_CHECKING:
+    from pydrake.lcm import DrakeLcmInterface
+
+# How long `start` waits for its process, and the first status and poses.
+_START_TIME: Final = 10.0  # s
+_FAULTS: Final = frozenset(Fault)
+
+
+class LcmArm:
+    """The robot: sends commands, and reads its status from shared memory.
+
+    Args:
+        lcm: Where to send.
+        status: What a `Receiver` writes.
+    """
+
+    def __init__(self, lcm: "DrakeLcmInterface", status: SharedVector) -> None:
+        self._lcm = lcm
+        self._status = status
+        self._engaged = False
+
+    def command(self, position: np.ndarray, engaged: bool) -> None:
+        """Sends a command, and does not wait for anything.
+
+        Args:
+            position: Of the joints, shape (6,), rad.
+            engaged: Whether the arm is to follow.
+        """
+        message = lcmt_ur_command()
+        message.utime = int(time.monotonic() * 1e6)
+        message.engaged = engaged
+        message.joint_position = list(position)
+        self._lcm.Publish(COMMAND_CHANNEL, message.encode())
+        self._engaged = engaged
+
+    def let_go(self) -> None:
+        """Says that the arm is to follow no more, if it does."""
+        if self._engaged:
+            self.command(np.full(6, np.nan), engaged=False)
+
+    def read(self) -> ArmMeasurement:
+        """The newest measurement; its numbers are nan before the first.
+
+        A fault that is none of ours is `Fault.NOT_RUNNING`.
+        """
+        values, stamp = self._status.read()
+        if math.isnan(stamp):
+            nan = np.full(6, np.nan)
+            return ArmMeasurement(nan, nan, Fault.NONE, math.inf)
+        position, velocity, (fault, measured) = np.split(values, [6, 12])
+        return ArmMeasurement(
+            position,
+            velocity,
+            Fault(fault) if fault in _FAULTS else Fault.NOT_RUNNING,
+            time.monotonic() - measured,
+        )
+
+
+class LcmTracker:
+    """The tracker: reads poses from shared memory.
+
+    Args:
+        poses: What a `Receiver` writes.
+    """
+
+    def __init__(self, poses: SharedVector) -> None:
+        self._poses = poses
+
+    def read(self) -> list[ObjectPose]:
+        """What is known of each object now, in the order of `LcmConfig.objects`."""
+        from pydrake.common.eigen_geometry import Quaternion
+        from pydrake.math import RigidTransform
+
+        now = time.monotonic()
+        poses = []
+        for row in self._poses.read()[0].reshape(-1, POSE_SIZE):
+            position, quaternion, seen = row[:3], row[3:7], row[7]
+            if math.isnan(seen):
+                poses.append(ObjectPose(RigidTransform(np.full(3, np.nan)), math.inf))
+                continue
+            rotation = Quaternion(quaternion / np.linalg.norm(quaternion))
+            poses.append(ObjectPose(RigidTransform(rotation, position), now - seen))
+        return poses
+
+
+class LcmDriver:
+    """Talks to a driver over LCM, and receives in a process of its own.
+
+    The process survives malformed messages and silence.  It ends with `stop`, with this
+    object, or with the process that started it.
+
+    Args:
+        config: Where, and the names of the objects.
+
+    Raises:
+        InputError: If `config` is impossible.
+    """
+
+    def __init__(self, config: LcmConfig) -> None:
+        from pydrake.lcm import DrakeLcm, DrakeLcmParams
+
+        config.validate()
+        self._config = config
+        self._status = SharedVector(STATUS_SIZE)
+        self._poses = SharedVector(len(config.objects) * POSE_SIZE)
+        # Deferred: what only sends needs no thread that receives.
+        params = DrakeLcmParams(lcm_url=config.url, defer_initialization=True)
+        self.arm = LcmArm(DrakeLcm(params), self._status)
+        self.tracker = LcmTracker(self._poses)
+        self._end: weakref.finalize | None = None
+
+    def start(self) -> None:
+        """Starts to receive, and waits until robot and objects have been heard of.
+
+        Raises:
+            WorkError: If the driver says nothing, has not seen an object, or has a
+                fault.
+            RuntimeError: If it was started before.
+        """
+        if self._end is not None:
+            raise RuntimeError("the LCM driver is running.")
+        # Drake and torch start threads, which a forked child would inherit broken.
+        process = multiprocessing.get_context("spawn").Process(
+            target=receive,
+            args=(self._config, self._status, self._poses),
+            name="lcm",
+            daemon=True,
+        )
+        process.start()
+        self._end = weakref.finalize(self, _kill, process)
+        try:
+            self._WaitForAll()
+        except BaseException:  # Ctrl-C, too.
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """Lets the arm go, and ends the process, if it runs."""
+        if self._end is not None:
+            self.arm.let_go()
+            self._end()
+            self._end = None
+
+    def _WaitForAll(self) -> None:
+        give_up_at = time.monotonic() + _START_TIME
+        while missing := self._find_missing():
+            if time.monotonic() > give_up_at:
+                raise WorkError(
+                    f"no {missing} at {self._config.url} within {_START_TIME:g} s; "
+                    "does the driver run?"
+                )
+            time.sleep(0.01)
+        fault = self.arm.read().fault
+        if fault != Fault.NONE:
+            raise WorkError(
+                f"the driver has stopped the arm and has to be started anew: "
+                f"{describe(fault)}"
+            )
+
+    def _find_missing(self) -> str:
+        """What has not been heard of, in words; empty if all has."""
+        if math.isinf(self.arm.read().age):
+            return STATUS_CHANNEL
+        unseen = [
+            name
+            for name, pose in zip(
+                self._config.objects, self.tracker.read(), strict=True
+            )
+            if math.isinf(pose.age)
+        ]
+        return f"{POSES_CHANNEL} of {', '.join(unseen)}" if unseen else ""
+
+
+def _kill(process: BaseProcess) -> None:
+    """Ends a process that has nothing to save, and waits until it has ended."""
+    process.kill()
+    process.join()
