@@ -26,6 +26,7 @@ from rhp_drake.lab.controller import (
 )
 from rhp_drake.lab.modes import RuntimeState, SafetyMode
 from rhp_drake.station.ports import COMMAND_PERIOD
+from rhp_drake.station.ur5_kinematics import forward_kinematics
 
 
 def test_stays_without_a_command():
@@ -74,6 +75,19 @@ def test_servo_stop_decelerates_as_asked():
     target = bench.positions[-1] + 0.01
     bench.servo(target)
     np.testing.assert_allclose(bench.tick(100), target, atol=1e-4)
+
+
+def test_servo_stop_is_in_the_hands_terms():
+    bench = Bench()
+    q = bench.positions[-1].copy()
+    for _ in range(50):
+        # Wrist 3 turns back what pan turns: the hand does not turn.
+        q = q + 1.0 * COMMAND_PERIOD * np.array([1, 0, 0, 0, 0, 1])
+        bench.servo(q)
+    before, now = (forward_kinematics(x)[:3, 3] for x in bench.positions[-2:])
+    speed = np.linalg.norm(now - before) / COMMAND_PERIOD
+    ticks = bench.run(SERVO_STOP, 2.0)
+    assert ticks * COMMAND_PERIOD == pytest.approx(speed / 2.0, abs=0.02)
 
 
 def test_speed():

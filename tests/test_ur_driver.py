@@ -36,7 +36,12 @@ def robot(robot_process):
 
 def make_driver(**changes):
     # Patient: the machine may have other things to do.
-    values = {"host": HOST, "command_timeout": 0.5, "connection_timeout": 30.0}
+    values = {
+        "host": HOST,
+        "command_timeout": 0.5,
+        "measurement_timeout": 0.5,
+        "connection_timeout": 30.0,
+    }
     return UrDriver(UrDriverConfig(**values | changes), COMMAND_PERIOD)
 
 

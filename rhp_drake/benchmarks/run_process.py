@@ -201,7 +201,7 @@ class _WatchedTracker:
         self._tracker = tracker
         self._ages = ages
 
-    def read(self) -> list[ObjectPose]:
+    def read(self) -> Sequence[ObjectPose]:
         """See `Tracker`."""
         poses = self._tracker.read()
         self._ages.append(max(pose.age for pose in poses))

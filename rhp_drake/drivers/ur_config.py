@@ -15,8 +15,8 @@ class UrDriverConfig:
         lookahead_time: Of servoJ, 0.03 to 0.2 s: more is smoother and later.
         gain: Of servoJ, 100 to 2000: more follows closer.
         limits: On commands.
-        command_timeout: How long the arm may move without a new command, s, and the
-            robot be silent.
+        command_timeout: How long the arm may move without a new command, s.
+        measurement_timeout: How long the robot may be silent, s.
         patience: How long it may stand still without one, s: a policy thinks while the
             hand rests.
         connection_timeout: How long the robot may take to answer at first, s.
@@ -28,7 +28,8 @@ class UrDriverConfig:
     lookahead_time: float = 0.1
     gain: float = 300.0
     limits: JointLimits = field(default_factory=JointLimits)
-    command_timeout: float = 0.06
+    command_timeout: float = 0.05
+    measurement_timeout: float = 0.04
     patience: float = 5.0
     connection_timeout: float = 10.0
     dry_run: bool = False
@@ -42,6 +43,7 @@ class UrDriverConfig:
             ("lookahead_time", 0.03, 0.2),
             ("gain", 100.0, 2000.0),
             ("command_timeout", 0.01, 1.0),
+            ("measurement_timeout", 0.01, 1.0),
             ("patience", 0.01, 600.0),
             ("connection_timeout", 0.1, 600.0),
         ):

@@ -35,8 +35,8 @@ NUM_JOINTS: Final = 6
 
 # ur_rtde ignores speed and acceleration of servoJ, but checks their ranges.
 _UNUSED: Final = 0.5
-# m/s^2 of the tool, since servoStop ends in stopl; ur_rtde's own is 10.
-_DECELERATION: Final = 8.0
+# m/s^2 of the tool, since servoStop ends in stopl, and rad/s^2; ur_rtde's own.
+_DECELERATION: Final = 10.0
 # Hz: the controller stops by itself when it hears less often from us, that is after
 # five commands of a CB3 that did not come.
 _WATCHDOG_FREQUENCY: Final = 25.0
@@ -252,7 +252,7 @@ class Stream:
         control = self._control
         if not (receive.isConnected() and (control is None or control.isConnected())):
             return Fault.CONNECTION_LOST
-        if age > self._config.command_timeout:
+        if age > self._config.measurement_timeout:
             return Fault.STALE_MEASUREMENT
         return self._check_modes(position, velocity)
 

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from rhp_drake.lab.motions import Motion, Move, Servo, Speed, Stop
+from rhp_drake.lab.motions import Motion, Move, Servo, Speed, Stop, ToolStop
 from rhp_drake.lab.rtde_packets import Value
 from rhp_drake.station.ports import NUM_JOINTS
 
@@ -193,12 +193,12 @@ class ControlScript:
             case "servoStop" | "speedStop":
                 self._end_thread("servo", "speed")
                 _check((), reals[0])
-                # The first is in m/s^2 of the tool; here all joints take it for theirs.
-                self._begin(Stop(reals[0]), "")
+                self._begin(ToolStop(reals[0]), "")
             case "stopJ" | "stopL":
                 self._end_thread("move", "stop")
                 _check((), reals[0])
-                self._begin(Stop(reals[0]), "stop" if alone else "")
+                kind = Stop if name == "stopJ" else ToolStop
+                self._begin(kind(reals[0]), "stop" if alone else "")
             case "setWatchdog":
                 _check((), reals[0])
                 self._watchdog, self._heard_at = 1 / reals[0], command.time

@@ -9,11 +9,15 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from rhp_drake.station.ur5_kinematics import forward_kinematics
+
 # Position and velocity of the joints, shape (6,) each.
 State = tuple[np.ndarray, np.ndarray]
 
 # URScript manual: servoj takes lookahead times from 0.03 s on.
 _SHORTEST_LOOKAHEAD: Final = 0.03
+# m/s, rad/s: a hand this slow is at rest.
+_SLOW: Final = 1e-9
 
 
 class Motion(Protocol):
@@ -107,6 +111,42 @@ class Stop:
         self._rests = left <= 1e-9
         velocity = np.zeros(6) if self._rests else velocity * (left / fastest)
         return position + velocity * period, velocity
+
+
+class ToolStop:
+    """`stopl`: all joints slow down in proportion, in the time that the tool takes.
+
+    Args:
+        deceleration: Of the hand, m/s^2, and as much in rad/s^2: URScript's manual has
+            the one for the other if that is not given.
+    """
+
+    def __init__(self, deceleration: float) -> None:
+        self._deceleration = deceleration
+        self._stop: Stop | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether all joints are at rest."""
+        return self._stop is not None and self._stop.done
+
+    def step(self, position: np.ndarray, velocity: np.ndarray, period: float) -> State:
+        """Slower by what the tool's deceleration allows."""
+        if self._stop is None:
+            fastest = np.abs(velocity).max()
+            speed = max(_hand_speeds(position, velocity))
+            self._stop = Stop(self._deceleration * fastest / max(speed, _SLOW))
+        return self._stop.step(position, velocity, period)
+
+
+def _hand_speeds(position: np.ndarray, velocity: np.ndarray) -> tuple[float, float]:
+    """How fast the hand moves, m/s, and turns, rad/s."""
+    step = 1e-6  # s
+    X_WH = forward_kinematics(position)
+    change = forward_kinematics(position + step * velocity) - X_WH
+    # Of a small turn's matrix the elements are the angle times sqrt(2), together.
+    turn = float(np.linalg.norm(change[:3, :3])) / math.sqrt(2)
+    return float(np.linalg.norm(change[:3, 3])) / step, turn / step
 
 
 class Move:

@@ -47,8 +47,8 @@ class CommandGuardConfig(JointLimits):
 
     workspace_margin: float = 0.02
     height_tolerance: float = 0.004
-    object_age_limit: float = 0.06
-    arm_age_limit: float = 0.06
+    object_age_limit: float = 0.05
+    arm_age_limit: float = 0.05
 
     def validate(self) -> None:
         """Raises an InputError if a limit is not positive."""
