@@ -39,9 +39,9 @@ _NUM_OBJECTS: Final = 3
 # Loopback address of the lab, beside that of `rhp lab`.
 _HOST: Final = "127.0.0.3"
 # s after the first motion: an action takes one to two.
-_LATEST: Final = 2.5
+_LATEST: Final = 2.0
 # s for which the arm is watched after something went wrong.
-_WATCHED: Final = 0.8
+_WATCHED: Final = 0.7
 # s
 _START_TIME: Final = 20.0
 _END_TIME: Final = 20.0
@@ -59,7 +59,7 @@ class Injection:
         kind: Its name in `FAULT_KINDS`.
         moving: Whether the arm moved at that moment.
         said: The fault that the run ended with; "" if it went on, or nobody was left.
-        hold_ms: From that moment until the arm was at rest for good, ms; nan if the
+        hold_ms: From that moment until the arm held its place for good, ms; nan if the
             run went on.
         num_commands: How many positions the controller was told.
         bad_command: What was wrong with one of them; "" if all were in order.
@@ -164,7 +164,7 @@ def _inject(
         problem, report = problem or report, RunReport()
     said = _fault_said(report)
     went_on = kind.tolerable and said == Fault.NONE
-    hold_ms = math.nan if went_on else 1000 * max(0.0, log.rests_from() - at)
+    hold_ms = math.nan if went_on else 1000 * max(0.0, log.holds_from() - at)
     return Injection(
         index=index,
         kind=name,

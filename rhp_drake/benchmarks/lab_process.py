@@ -23,8 +23,11 @@ from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.task import TaskInstance
 from rhp_drake.workers import follow_parent
 
-# rad/s: a joint that is slower is at rest.
-REST_SPEED: Final = 0.02
+# rad/s: a joint that is slower does not move.
+_REST_SPEED: Final = 0.02
+# rad from where it stays in the end: a joint that is nearer holds.  That is half a
+# millimetre at the hand, where a joint's servo takes its time to settle.
+_HOLDING: Final = 0.001
 # Where the tracker serves: Motive's default.
 _NATNET_PORT: Final = 1510
 # s: the longest that any request takes, on a machine with other things to do.
@@ -37,7 +40,8 @@ class LabLog:
 
     Attributes:
         times: Of each period of the controller, s of time.monotonic, shape (N,).
-        speeds: The fastest joint's then, as measured, rad/s, shape (N,).
+        positions: Of the joints then, as measured, rad, shape (N, 6).
+        speeds: The fastest joint's, rad/s, shape (N,).
         command_times: When a position of servoJ was taken, s since the lab began,
             shape (K,).
         commands: These positions, rad, shape (K, 6).
@@ -45,20 +49,22 @@ class LabLog:
     """
 
     times: np.ndarray
+    positions: np.ndarray
     speeds: np.ndarray
     command_times: np.ndarray
     commands: np.ndarray
     stop_reason: str
 
-    def rests_from(self) -> float:
-        """Since when the arm has been at rest, s of time.monotonic."""
-        moving = np.flatnonzero(self.speeds > REST_SPEED)
+    def holds_from(self) -> float:
+        """Since when the arm has held its place, s of time.monotonic."""
+        away = np.abs(self.positions - self.positions[-1]).max(axis=1) > _HOLDING
+        moving = np.flatnonzero(away)
         return float(self.times[moving[-1]]) if len(moving) else -math.inf
 
     def moves_at(self, time_: float) -> bool:
         """Whether the arm moved at a time, s of time.monotonic."""
         index = min(int(np.searchsorted(self.times, time_)), len(self.times) - 1)
-        return bool(self.speeds[index] > REST_SPEED)
+        return bool(self.speeds[index] > _REST_SPEED)
 
 
 class LabProcess:
@@ -128,17 +134,20 @@ class _Session:
         self.lab = lab
         self.moves = False
         self._times: list[float] = []
+        self._positions: list[Any] = []
         self._speeds: list[float] = []
 
     def step(self) -> None:
         """One period, no faster than real time."""
         begin = time.monotonic()
         self.lab.step()
-        speeds = self.lab.controller.outputs()["actual_qd"]
+        outputs = self.lab.controller.outputs()
+        speeds = outputs["actual_qd"]
         assert isinstance(speeds, tuple)
         self._times.append(begin)
+        self._positions.append(outputs["actual_q"])
         self._speeds.append(max(map(abs, speeds)))
-        self.moves = self.moves or self._speeds[-1] > REST_SPEED
+        self.moves = self.moves or self._speeds[-1] > _REST_SPEED
         time.sleep(max(0.0, begin + COMMAND_PERIOD - time.monotonic()))
 
     def end(self) -> LabLog:
@@ -146,6 +155,7 @@ class _Session:
         taken = [c for c in self.lab.controller.commands if c.name == "servoJ"]
         return LabLog(
             np.array(self._times),
+            np.reshape(self._positions, (-1, NUM_JOINTS)),
             np.array(self._speeds),
             np.array([command.time for command in taken]),
             np.reshape([c.arguments[:NUM_JOINTS] for c in taken], (-1, NUM_JOINTS)),

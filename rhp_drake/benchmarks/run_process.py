@@ -29,6 +29,8 @@ from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 
 # s: the longest that a process of ours takes to start.
 _PATIENCE: Final = 120.0
+# s: an arm that moves brakes first.
+_END_TIME: Final = 5.0
 # rad: far beyond what one command may add.
 _JUMP: Final = 0.3
 
@@ -109,9 +111,11 @@ class RunProcess:
         self._end()
 
     def _end(self) -> None:
+        # It ends when nobody is at the other end.
+        self._connection.close()
+        self._process.join(_END_TIME)
         self._process.kill()
         self._process.join()
-        self._connection.close()
 
     def restart(self) -> None:
         """A new process, after the old one was killed or hangs."""
