@@ -202,7 +202,7 @@ def test_bad_config(config):
     [
         ({"arm_age": 0.051}, Fault.STALE_MEASUREMENT),
         ({"arm_age": math.nan}, Fault.STALE_MEASUREMENT),
-        ({"object_ages": (0.0, 0.051)}, Fault.STALE_POSE),
+        ({"object_ages": (0.0, 0.081)}, Fault.STALE_POSE),
         ({"object_ages": (math.inf, 0.0)}, Fault.STALE_POSE),
         ({"object_ages": (0.0, math.nan)}, Fault.STALE_POSE),
         ({"arm_fault": Fault.PROTECTIVE_STOP}, Fault.PROTECTIVE_STOP),
@@ -215,7 +215,7 @@ def test_bad_config(config):
 )
 def test_old_measurements_and_faults_of_the_robot_stop_the_arm(known, expected):
     dut = Bench()
-    dut.know(arm_age=0.049, object_ages=(0.049, 0.0), roll_deg=14.0)
+    dut.know(arm_age=0.049, object_ages=(0.079, 0.0), roll_deg=14.0)
     assert dut.tick(START)[1] == Fault.NONE
     dut.know(**known)
     moved = np.add(START, [SMALL, 0, 0, 0, 0, 0])

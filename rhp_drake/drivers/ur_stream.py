@@ -35,8 +35,10 @@ NUM_JOINTS: Final = 6
 
 # ur_rtde ignores speed and acceleration of servoJ, but checks their ranges.
 _UNUSED: Final = 0.5
-# m/s^2 of the tool, since servoStop ends in stopl, and rad/s^2; ur_rtde's own.
-_DECELERATION: Final = 10.0
+# m/s^2 of the tool, since servoStop ends in stopl, and rad/s^2.  The hand turns no
+# faster than 0.6 rad/s: it is at rest before the watchdog ends the program, which
+# brakes less hard.
+_DECELERATION: Final = 20.0
 # Hz: the controller stops by itself when it hears less often from us, that is after
 # five commands of a CB3 that did not come.
 _WATCHDOG_FREQUENCY: Final = 25.0

@@ -47,7 +47,7 @@ class CommandGuardConfig(JointLimits):
 
     workspace_margin: float = 0.02
     height_tolerance: float = 0.004
-    object_age_limit: float = 0.05
+    object_age_limit: float = 0.08
     arm_age_limit: float = 0.05
 
     def validate(self) -> None:
