@@ -1,6 +1,7 @@
-"""Meshcat for a run: its camera and light, and bands drawn on the table."""
+"""Meshcat for a run: its camera and light, bands drawn on the table, and text."""
 
 from dataclasses import dataclass, field
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
 
 # s between frames: four periods of the robot's commands, eight steps of the physics.
 FRAME_PERIOD: Final = 0.032
+# Pixels of a line of text.
+_FONT_SIZE: Final = 32
 # The background's colors, at the top and at the bottom.
 SKY: Final = ([0.93, 0.95, 0.97], [0.72, 0.76, 0.80])
 
@@ -107,6 +110,50 @@ def draw_bands(
         meshcat.SetTriangleColorMesh(path, vertices, faces, colors)
 
 
+def draw_text(
+    meshcat: "Meshcat", path: str, text: str, line_height: float, color: np.ndarray
+) -> None:
+    """Draws text as one object, since Meshcat has none.
+
+    It stands in the y-z plane of its path's frame, to be read from +x, above the
+    origin and centred.
+
+    Args:
+        meshcat: Where to draw.
+        path: What to call the object.
+        text: One line or several.
+        line_height: m.
+        color: Red, green and blue, 0 to 1.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    # A pixel row of the letters' bitmap is as many rectangles as it has runs.
+    font = ImageFont.load_default(size=_FONT_SIZE)
+    size = ImageDraw.Draw(Image.new("1", (1, 1))).multiline_textbbox((0, 0), text, font)
+    image = Image.new("1", (math.ceil(size[2]), math.ceil(size[3])))
+    ImageDraw.Draw(image).multiline_text((0, 0), text, 1, font)
+    edges = np.diff(np.pad(np.asarray(image, dtype=int), ((0, 0), (1, 1))), axis=1)
+    rows, begins = np.nonzero(edges == 1)
+    _, ends = np.nonzero(edges == -1)
+    pixel = line_height / _FONT_SIZE
+    left, right = (pixel * (x - image.width / 2) for x in (begins, ends))
+    top = pixel * (image.height - rows)
+    corners = [(left, top), (right, top), (right, top - pixel), (left, top - pixel)]
+    vertices = np.stack([np.stack([0 * y, y, z]) for y, z in corners], axis=2).reshape(
+        3, -1
+    )
+    colors = np.repeat(color[:, None] ** 2.2, vertices.shape[1], axis=1)
+    meshcat.SetTriangleColorMesh(path, vertices, _rectangles(len(rows)), colors)
+
+
+def _rectangles(number: int) -> np.ndarray:
+    """Faces (3, 2 number) of rectangles whose corners follow each other."""
+    first = 4 * np.arange(number, dtype=np.int32)
+    return np.concatenate(
+        [[first, first + 1, first + 2], [first, first + 2, first + 3]], axis=1
+    ).astype(np.int32)
+
+
 def _bands(
     begins: np.ndarray, ends: np.ndarray, width: float, height: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -134,8 +181,4 @@ def _bands(
         axis=1,
     ).reshape(-1, 2)
     vertices = np.column_stack([corners, np.full(len(corners), height)]).T
-    first = 4 * np.arange(len(begins), dtype=np.int32)
-    faces = np.concatenate(
-        [[first, first + 1, first + 2], [first, first + 2, first + 3]], axis=1
-    )
-    return vertices, faces.astype(np.int32)
+    return vertices, _rectangles(len(begins))

@@ -7,10 +7,10 @@ from rhp_drake.commands.tree_drawing import TreeDrawing
 from rhp_drake.planning.policy import Decision
 from rhp_drake.planning.search import Growth
 from rhp_drake.random_streams import stream
-from rhp_drake.safety import Fault, describe
+from rhp_drake.safety import Fault
 from rhp_drake.systems.meshcat_overlay import MeshcatOverlay
 from rhp_drake.systems.receding_horizon_planner import NO_DECISION, DecisionRecord
-from rhp_drake.visualization import _bands
+from rhp_drake.visualization import _bands, draw_text
 
 
 class FakeMeshcat:
@@ -20,7 +20,6 @@ class FakeMeshcat:
         self.paths = set()
         self.visible = {}
         self.num_faces = {}
-        self.buttons = set()
         self.sky = {}
 
     def Delete(self, path):
@@ -45,14 +44,6 @@ class FakeMeshcat:
             return
         assert name == "visible"
         self.visible.setdefault(path, {})[time_in_recording] = value
-
-    def AddButton(self, name):
-        assert name not in self.buttons
-        self.buttons.add(name)
-
-    def DeleteButton(self, name, strict):
-        assert not strict
-        self.buttons.discard(name)
 
     def HasPath(self, path):
         return any(p == path or p.startswith(path + "/") for p in self.paths)
@@ -132,13 +123,11 @@ def test_a_fault_is_shown_until_the_next_run(instance):
     well = dict(meshcat.sky)
     for time in (0.5, 0.6):
         publish(overlay, instance, time, NO_DECISION, fault=Fault.STALE_POSE)
-    assert meshcat.buttons == {"STOPPED: an object has not been seen for too long."}
-    assert "/overlay/fault" in meshcat.paths
+    assert {"/overlay/fault/frame", "/overlay/fault/sign"} <= meshcat.paths
     assert meshcat.visible["/overlay/fault"] == {0.0: False, 0.5: True}
     assert meshcat.sky != well
     publish(overlay, instance, 0.0, NO_DECISION, initialize=True)
-    assert not meshcat.buttons
-    assert "/overlay/fault" not in meshcat.paths
+    assert not meshcat.HasPath("/overlay/fault")
     assert meshcat.sky == well
 
 
@@ -197,8 +186,29 @@ def test_real_meshcat(instance):
     assert meshcat.HasPath("/overlay/goal/2/reached")
     assert meshcat.HasPath("/overlay/roll_outs/1/0/hand")
     assert meshcat.HasPath("/overlay/fault")
-    assert meshcat.DeleteButton(f"STOPPED: {describe(Fault.HAND_OUTSIDE)}")
     assert "<html>" in meshcat.StaticHtml()
+
+
+def test_text_is_as_wide_as_it_is_long():
+    class Canvas:
+        def SetTriangleColorMesh(self, path, vertices, faces, colors):
+            assert vertices.shape == colors.shape
+            assert faces.max() == vertices.shape[1] - 1
+            self.vertices = vertices
+
+    canvas = Canvas()
+    extents = []
+    for text in ("H", "HHHH", "HHHH\nHH"):
+        draw_text(canvas, "/sign", text, 0.1, np.array([1.0, 0.0, 0.0]))
+        low, high = canvas.vertices.min(axis=1), canvas.vertices.max(axis=1)
+        assert low[0] == high[0] == 0
+        assert low[1] == pytest.approx(-high[1], abs=0.02)
+        assert low[2] >= 0
+        extents.append(high - low)
+    one, four, lines = extents
+    assert 3 * one[1] < four[1] < 6 * one[1]
+    assert 0.05 < one[2] < 0.1
+    assert one[2] + 0.08 < lines[2] < one[2] + 0.15
 
 
 def test_bands():

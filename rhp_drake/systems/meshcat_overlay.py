@@ -1,17 +1,19 @@
 """Draws the task, the planner's thoughts and faults in Meshcat."""
 
+import math
+import textwrap
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Cylinder, Meshcat, Rgba
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from rhp_drake import task
 from rhp_drake.safety import Fault, describe
 from rhp_drake.systems.receding_horizon_planner import NO_DECISION
-from rhp_drake.visualization import FRAME_PERIOD, SKY, draw_bands, set_sky
+from rhp_drake.visualization import FRAME_PERIOD, SKY, draw_bands, draw_text, set_sky
 
 if TYPE_CHECKING:
     from rhp_drake.planning.policy import Decision
@@ -32,6 +34,12 @@ _BEST_WIDTH: Final = 0.010
 # After a fault: a frame around the workspace, and the sky.
 FAULT_COLOR: Final = (0.85, 0.05, 0.05)
 _FRAME_WIDTH: Final = 0.02
+# Beside the base, where nothing hides it, and facing where the camera is at first.
+_X_W_SIGN: Final = RigidTransform(
+    RotationMatrix.MakeZRotation(math.radians(-23)), [-0.3, -0.5, 0.12]
+)
+_SIGN_WIDTH: Final = 24  # Letters of a line.
+_SIGN_LINE: Final = 0.055  # m
 _FAULT_SKY: Final = ([1.0, 0.80, 0.78], [0.85, 0.45, 0.42])
 
 
@@ -42,8 +50,8 @@ class MeshcatOverlay(LeafSystem):
     is inside.  Of each roll-out the hand's path is blue and the target's green; the
     roll-out with the highest return is drawn wide and dark.
 
-    After a fault the workspace has a red frame and the background is red, and among
-    Meshcat's controls stands why, on a button that does nothing.
+    After a fault the workspace has a red frame and the background is red, and behind
+    the robot stands why.
 
     Recordings keep properties but no new objects.  So each decision gets objects of
     its own, under a path with its number, and only their visibility changes in time.
@@ -81,8 +89,6 @@ class MeshcatOverlay(LeafSystem):
     def _PublishDiscs(self, context: Context) -> EventStatus:
         """Draws the goal regions, and forgets the roll-outs of the run before."""
         self._meshcat.Delete(PATH)
-        for fault in Fault:
-            self._meshcat.DeleteButton(_label(fault), strict=False)
         set_sky(self._meshcat, SKY, context.get_time())
         goals = self._goals.Eval(context).reshape(-1, 2)
         disc = Cylinder(task.GOAL_RADIUS, _DISC_THICKNESS)
@@ -127,17 +133,25 @@ class MeshcatOverlay(LeafSystem):
         corners = np.array([[left, front], [right, front], [right, back], [left, back]])
         draw_bands(
             self._meshcat,
-            _FAULT_PATH,
+            f"{_FAULT_PATH}/frame",
             corners,
             np.roll(corners, -1, axis=0),
             np.array(FAULT_COLOR),
             _FRAME_WIDTH,
             _BEST_HEIGHT,
         )
+        lines = textwrap.wrap(f"Stopped: {describe(fault)}", _SIGN_WIDTH)
+        draw_text(
+            self._meshcat,
+            f"{_FAULT_PATH}/sign",
+            "\n".join(lines),
+            _SIGN_LINE,
+            np.array(FAULT_COLOR),
+        )
+        self._meshcat.SetTransform(f"{_FAULT_PATH}/sign", _X_W_SIGN)
         self._meshcat.SetProperty(_FAULT_PATH, "visible", False, 0.0)
         self._meshcat.SetProperty(_FAULT_PATH, "visible", True, time)
         set_sky(self._meshcat, _FAULT_SKY, time)
-        self._meshcat.AddButton(_label(fault))
 
     def _ShowRollOuts(self, index: int, decision: "Decision", time: float) -> None:
         """Draws the roll-outs of decision number `index`, and hides those before."""
@@ -177,10 +191,6 @@ class MeshcatOverlay(LeafSystem):
 
 
 _FAULT_PATH: Final = f"{PATH}/fault"
-
-
-def _label(fault: Fault) -> str:
-    return f"STOPPED: {describe(fault)}"
 
 
 def _disc_path(index: int) -> str:
