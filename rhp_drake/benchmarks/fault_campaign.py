@@ -39,9 +39,9 @@ _NUM_OBJECTS: Final = 3
 # Loopback address of the lab, beside that of `rhp lab`.
 _HOST: Final = "127.0.0.3"
 # s after the first motion: an action takes one to two.
-_LATEST: Final = 2.0
+_LATEST: Final = 1.6
 # s for which the arm is watched after something went wrong.
-_WATCHED: Final = 0.7
+_WATCHED: Final = 0.5
 # s
 _START_TIME: Final = 20.0
 _END_TIME: Final = 20.0
@@ -248,7 +248,6 @@ class KindSummary:
         stopped: How many runs ended for it.
         named: How many of them named a cause of it.
         hold_ms: Of those that ended while the arm moved: median and longest, ms.
-        problems: What was wrong, without repetition.
     """
 
     kind: str
@@ -257,7 +256,6 @@ class KindSummary:
     stopped: int
     named: int
     hold_ms: tuple[float, float]
-    problems: tuple[str, ...]
 
 
 def summarize(injections: Sequence[Injection]) -> list[KindSummary]:
@@ -278,9 +276,6 @@ def summarize(injections: Sequence[Injection]) -> list[KindSummary]:
                 stopped=len(ended),
                 named=sum(x.said in causes for x in ended),
                 hold_ms=(float(np.median(held)), max(held)),
-                problems=tuple(
-                    sorted({x.bad_command or x.problem for x in of_kind} - {""})
-                ),
             )
         )
     return summaries

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
+import torch
 
 from rhp_drake.benchmarks.lab_process import LabProcess
 from rhp_drake.benchmarks.run_process import RunProcess, RunReport
@@ -72,6 +73,8 @@ def run_both_ways(count: int) -> Iterator[LoopbackRun]:
     Raises:
         WorkError: If the lab or the closed loop cannot be started.
     """
+    # As in the other process: sums of as many threads have the same bits.
+    torch.set_num_threads(1)
     _, scenario = load_scenario(_SCENARIO, overrides=[_POLICY])
     policy = MakePolicy(scenario.policy, _NUM_OBJECTS)
     simulator = Simulator(MakeClosedLoop(scenario, policy))

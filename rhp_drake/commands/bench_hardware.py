@@ -41,6 +41,10 @@ def loopback(
             runs.append(run)
             progress.advance(bar)
     console.print(_outcome_table(runs))
+    console.print(
+        "With the number of actions; how many of them are alike until one differs; how "
+        "many a policy of another process decides again from the same poses.\n"
+    )
     console.print(_timing_table(runs))
     console.print(describe_machine())
 
@@ -59,17 +63,17 @@ def _outcome_table(runs: "Sequence[LoopbackRun]") -> "Table":
     table.add_column("task", justify="right")
     for heading in ("in one process", "over loopback"):
         table.add_column(heading, no_wrap=True)
-    for heading in ("same at first", "recomputed alike", "s"):
+    for heading in ("alike", "again", "s"):
         table.add_column(heading, justify="right")
     for run in runs:
         table.add_row(
             str(run.index),
             *(
-                f"{status.replace('_', ' ')}, {actions} actions"
+                f"{status.replace('_', ' ')}, {actions}"
                 for status, actions in (run.in_process, run.over_loopback)
             ),
             str(run.common),
-            f"{run.recomputed} of {run.num_decisions}",
+            f"{run.recomputed}/{run.num_decisions}",
             f"{run.seconds:.1f}",
         )
     return table
@@ -166,21 +170,20 @@ def _fault_table(injections: "Sequence[Injection]") -> "Table":
     from rhp_drake.benchmarks.fault_campaign import HOLD_TIME, summarize
 
     table = Table(
-        title=f"Faults by kind; the arm has to hold within {1000 * HOLD_TIME:.0f} ms",
+        title="Faults by kind, and how soon a moving arm held its place: median and "
+        f"longest (at most {1000 * HOLD_TIME:.0f} ms)",
         box=SIMPLE_HEAD,
         title_justify="left",
         show_edge=False,
     )
     table.add_column("what goes wrong", no_wrap=True)
-    for heading in ("runs", "moving", "ended", "named", "ms, median", "longest"):
+    for heading in ("runs", "moving", "ended", "named", "ms", "longest"):
         table.add_column(heading, justify="right")
-    table.add_column("wrong")
     for row in summarize(injections):
         median, longest = row.hold_ms
         table.add_row(
             row.kind,
             *map(str, (row.count, row.moving, row.stopped, row.named)),
             *("" if math.isnan(ms) else f"{ms:.0f}" for ms in (median, longest)),
-            "; ".join(row.problems),
         )
     return table
