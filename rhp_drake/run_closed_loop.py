@@ -36,6 +36,7 @@ class Outcome:
         num_actions: How many actions were executed.
         time: Simulated time, s.
         target_distance: From the target to the centre of its goal region, m.
+        fault: Why the arm was stopped, if it was.
     """
 
     status: str
@@ -43,6 +44,7 @@ class Outcome:
     num_actions: int
     time: float
     target_distance: float
+    fault: Fault = Fault.NONE
 
     @property
     def succeeded(self) -> bool:
@@ -104,7 +106,7 @@ def run_on_hardware(
         on_decision: Called soon after each decision.
 
     Raises:
-        InputError: If not all objects are seen.
+        InputError: If not all objects are seen, or the hand is not where it can begin.
     """
     diagram, context = simulator.get_system(), simulator.get_mutable_context()
     _reset(simulator, seed)
@@ -114,6 +116,10 @@ def run_on_hardware(
     ages = station.GetOutputPort("object_ages").Eval(station_context)
     if unseen := np.flatnonzero(~np.isfinite(ages)).tolist():
         raise InputError(f"the tracker does not see the objects {unseen}.")
+    measured = station.GetOutputPort("ur5.position_measured").Eval(station_context)
+    # Where they are not finite, initialization says so.
+    if np.isfinite(measured).all():
+        diagram.GetSubsystemByName("hand_servo").check_start(measured)
     state = diagram.GetOutputPort("state").Eval(context)
     goals = task.object_positions(state).copy()
     goals[0] = goal
@@ -173,8 +179,6 @@ def _run(
         if guard_fault != Fault.NONE:
             end = GUARD_FAULT
             message = f"the arm was stopped: {describe(guard_fault)}"
-            # Nothing is published any more by itself.
-            diagram.ForcedPublish(context)
         elif planner_status != Status.RUNNING:
             end = planner_status.name.lower()
             message = diagram.GetOutputPort("message").Eval(context)
@@ -191,6 +195,7 @@ def _run(
         num_actions=num_actions,
         time=context.get_time(),
         target_distance=float(np.linalg.norm(offset)),
+        fault=guard_fault,
     )
 
 

@@ -14,6 +14,11 @@ import numpy as np
 from rhp_drake.errors import InputError
 
 _NUM_JOINTS: Final = 6
+# What the arm itself can do, rad and rad/s, and half a radian, which is as good as
+# lost: more would limit nothing.
+_LARGEST_POSITION: Final = math.tau
+_LARGEST_VELOCITY: Final = math.pi
+_LARGEST_TRACKING: Final = 0.5
 
 
 class Fault(enum.IntEnum):
@@ -84,14 +89,22 @@ class JointLimits:
 
     def validate(self) -> None:
         """Raises an InputError if a limit is impossible, or no limit at all."""
-        limits = [*self.position_limits, self.velocity_limit, self.tracking_limit]
-        # Written so that nan is refused, too; and infinity, which limits nothing.
-        possible = all(0 < limit < math.inf for limit in limits)
-        if len(self.position_limits) != _NUM_JOINTS or not possible:
+        if len(self.position_limits) != _NUM_JOINTS:
             raise InputError(
-                f"the joint limits need {_NUM_JOINTS} position limits, and all finite "
-                f"and positive; they are {self}."
+                f"position_limits: {self.position_limits}; there must be "
+                f"{_NUM_JOINTS} positive ones."
             )
+        for name, values, largest in (
+            ("position_limits", self.position_limits, _LARGEST_POSITION),
+            ("velocity_limit", [self.velocity_limit], _LARGEST_VELOCITY),
+            ("tracking_limit", [self.tracking_limit], _LARGEST_TRACKING),
+        ):
+            # Written so that nan is refused, too.
+            if not all(0 < value <= largest for value in values):
+                raise InputError(
+                    f"{name}: {', '.join(map(str, values))}; it must be positive, and "
+                    f"at most {largest:.2f}."
+                )
 
 
 def check_command(

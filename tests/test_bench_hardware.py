@@ -1,11 +1,13 @@
 """The benches of the hardware side: what they conclude from what they saw."""
 
+from dataclasses import asdict
 import json
 import math
 
 import numpy as np
 import pytest
 
+from rhp_drake.benchmarks import fault_campaign, loopback
 from rhp_drake.benchmarks.fault_campaign import (
     Injection,
     _bad_command,
@@ -25,6 +27,7 @@ from rhp_drake.station.hardware_station import HardwareConfig
 from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.ur5_kinematics import inverse_kinematics
 
+HOST = "127.0.0.27"  # Of this module alone.
 START = inverse_kinematics(np.array([0.5, 0.0, 0.2]))
 
 
@@ -132,15 +135,16 @@ PAN = np.array([1.0, 0, 0, 0, 0, 1.0])
         ([], ""),
         ([START, START + 0.011 * PAN], ""),
         ([START, START + 0.05 * PAN], "too fast"),
+        ([START + i * 0.02 * PAN for i in range(8)], "too fast"),
         ([START, START * math.nan], "not finite"),
         ([START + 7.0], "beyond a position limit"),
         (
             [inverse_kinematics(np.array([0.5, 0.0, 0.2]), 0.05)],
-            "the hand out of its workspace or height",
+            "the hand out of its workspace or height, or leaning",
         ),
         (
             [inverse_kinematics(np.array([0.5, 0.4, 0.2]))],
-            "the hand out of its workspace or height",
+            "the hand out of its workspace or height, or leaning",
         ),
     ],
 )
@@ -173,6 +177,14 @@ def test_summary():
     assert np.isnan(late.hold_ms).all()
 
 
+def test_a_file_of_another_seed_is_refused(tmp_path):
+    path = tmp_path / "injections.json"
+    path.write_text(json.dumps([asdict(injection(_kind(0, seed=0)))]))
+    other = next(s for s in range(1, 9) if _kind(0, s) != _kind(0, 0))
+    with pytest.raises(InputError, match="of another seed"):
+        list(run_campaign(path, 1, seed=other))
+
+
 def test_files_that_are_none(tmp_path):
     path = tmp_path / "injections.json"
     path.write_text(json.dumps([{"index": 0}]))
@@ -184,7 +196,8 @@ def test_files_that_are_none(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_campaign_goes_on_where_it_was(tmp_path):
+def test_a_campaign_goes_on_where_it_was(tmp_path, monkeypatch):
+    monkeypatch.setattr(fault_campaign, "_HOST", HOST)
     path = tmp_path / "injections.json"
     first = list(run_campaign(path, 2, seed=1))
     again = list(run_campaign(path, 3, seed=1))
@@ -194,7 +207,8 @@ def test_a_campaign_goes_on_where_it_was(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_task_over_loopback_ends_as_in_one_process():
+def test_a_task_over_loopback_ends_as_in_one_process(monkeypatch):
+    monkeypatch.setattr(loopback, "_HOST", HOST)
     (run,) = run_both_ways(1)
     assert run.in_process == run.over_loopback
     assert run.recomputed == run.num_decisions > 0

@@ -187,6 +187,9 @@ def test_config_loads_from_yaml():
         CommandGuardConfig(velocity_limit=0.0),
         CommandGuardConfig(tracking_limit=math.nan),
         CommandGuardConfig(velocity_limit=math.inf),
+        # As good as none.
+        CommandGuardConfig(velocity_limit=15.0),
+        CommandGuardConfig(tracking_limit=1.0),
         CommandGuardConfig(position_limits=[1.0]),
         CommandGuardConfig(object_age_limit=-1.0),
         CommandGuardConfig(height_tolerance=math.nan),

@@ -1,5 +1,6 @@
 """Tests of rhp_drake.systems.hand_servo."""
 
+from contextlib import nullcontext
 import math
 
 import numpy as np
@@ -14,6 +15,7 @@ from pydrake.systems.primitives import (
 )
 import pytest
 
+from rhp_drake.errors import InputError
 from rhp_drake.safety import Fault
 from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.ur5_kinematics import (
@@ -296,3 +298,10 @@ def test_ideal_robot_executes_all_actions():
             dut.simulator.AdvanceTo(dut.simulator.get_context().get_time() + 1.8)
             assert dut.fault == Fault.NONE
             np.testing.assert_allclose(dut.measured_pose, target, atol=1e-4)
+
+
+@pytest.mark.parametrize(("height", "good"), [(0.0005, True), (0.003, False)])
+def test_the_hand_has_to_begin_at_its_height(height, good):
+    start = inverse_kinematics(np.array([0.5, 0.1, 0.2]), PUSHING_HEIGHT + height)
+    with nullcontext() if good else pytest.raises(InputError, match="does not stand"):
+        HandServo().check_start(start)

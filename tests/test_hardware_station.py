@@ -197,6 +197,30 @@ def test_an_arm_that_nobody_has_heard_of_is_not_moved(hardware, monkeypatch):
         run(hardware, monkeypatch)
 
 
+def test_a_hand_that_is_too_high_keeps_the_run_from_starting(hardware, monkeypatch):
+    hardware.arm.position = inverse_kinematics(HAND, 0.05)
+    with pytest.raises(InputError, match="the hand does not stand upright"):
+        run(hardware, monkeypatch)
+    assert not hardware.arm.commands
+
+
+def test_a_fault_is_not_drawn_before_the_arm_was_stopped(hardware, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        MeshcatOverlay, "_ShowFault", lambda overlay, fault, time: drawn.append(fault)
+    )
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    loop = MakeClosedLoop(Scenario(), Forward(), meshcat, hardware)
+    simulator = Simulator(loop)
+    hardware.arm.fault = Fault.PROTECTIVE_STOP
+    outcome = run_on_hardware(simulator, np.array([0.7, 0.25]), seed=0)
+    assert outcome.fault == Fault.PROTECTIVE_STOP
+    assert drawn == []
+    loop.ForcedPublish(simulator.get_context())
+    assert drawn == [Fault.PROTECTIVE_STOP]
+
+
 def test_meshcat_shows_what_is_measured(hardware):
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     station = MakeStation(Scenario(), meshcat, hardware)

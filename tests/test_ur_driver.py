@@ -41,6 +41,7 @@ def make_driver(**changes):
         "command_timeout": 0.5,
         "measurement_timeout": 0.5,
         "connection_timeout": 30.0,
+        "dry_run": False,
     }
     return UrDriver(UrDriverConfig(**values | changes), COMMAND_PERIOD)
 

@@ -69,7 +69,7 @@ class Cycles:
 
     def __init__(self, robot, **changes):
         self.stream = ur_stream.Stream(
-            UrDriverConfig(host="robot", **changes),
+            UrDriverConfig(host="robot", dry_run=False, **changes),
             COMMAND_PERIOD,
             SharedVector(ur_stream.COMMAND_SIZE),
             SharedVector(ur_stream.MEASUREMENT_SIZE),
@@ -137,6 +137,15 @@ def test_whoever_engages_the_arm_anew_has_to_begin_where_it_is():
     elsewhere = START - 0.1 * PAN
     dut.command(START)
     assert dut.cycle(measured=elsewhere) == Fault.VELOCITY_LIMIT
+
+
+def test_an_arm_that_is_let_go_on_its_way_is_stopped():
+    dut = Cycles(Robot())
+    for q in (START, START + 0.5 * LIMIT * PAN):
+        dut.command(q)
+        assert dut.cycle() == Fault.NONE
+    dut.command(START, engaged=False)
+    assert dut.cycle() == Fault.STALE_COMMAND
 
 
 def test_a_robot_that_does_not_take_a_command_gets_no_other():

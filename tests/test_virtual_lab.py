@@ -1,6 +1,7 @@
 """The virtual lab: a station behind protocols, faults by their words, a whole run."""
 
 import json
+from pathlib import Path
 import subprocess
 import sys
 import time
@@ -8,7 +9,9 @@ import time
 import numpy as np
 import pytest
 
-from rhp_drake import cli
+from rhp_drake import cli, hardware
+from rhp_drake.drivers import ur_stream
+from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.errors import InputError
 from rhp_drake.frozen_instances import load_instances
 from rhp_drake.hardware import load_hardware
@@ -22,6 +25,7 @@ from rhp_drake.random_streams import VALIDATION, stream
 from rhp_drake.resources import scenarios_path
 from rhp_drake.station.station_models import StationConfig
 from rhp_drake.station.ur5_kinematics import hand_pose
+from rhp_drake.systems.command_guard import CommandGuardConfig
 
 # Of this module alone: the robot's ports are fixed.
 HOST, RUN_HOST = "127.0.0.25", "127.0.0.26"
@@ -152,12 +156,63 @@ def test_run_needs_as_many_bodies_as_objects(monkeypatch, capsys, tmp_path):
     )
 
 
+def test_the_arm_is_stopped_first_and_each_even_if_the_other_fails(monkeypatch):
+    calls = []
+
+    def fake(name):
+        class Driver:
+            def __init__(self, *arguments):
+                pass
+
+            def start(self):
+                calls.append(f"{name} starts")
+
+            def stop(self):
+                calls.append(f"{name} stops")
+                raise RuntimeError(name)
+
+        return Driver
+
+    monkeypatch.setattr(hardware, "UrDriver", fake("arm"))
+    monkeypatch.setattr(hardware, "NatNetDriver", fake("tracker"))
+    config = load_hardware(scenarios_path() / "virtual_lab.yaml")
+    with pytest.raises(RuntimeError), hardware.running_hardware(config, 3):
+        calls.append("run")
+    assert calls == [
+        "tracker starts",
+        "arm starts",
+        "run",
+        "arm stops",
+        "tracker stops",
+    ]
+
+
+def test_the_default_is_to_hold_still(tmp_path):
+    path = tmp_path / "lab.yaml"
+    path.write_text("lab: {ur: {host: robot}}")
+    assert load_hardware(path).ur.dry_run
+
+
+def test_the_documentation_says_the_defaults():
+    text = (Path(__file__).parents[1] / "docs" / "hardware.md").read_text()
+    ur, guard = UrDriverConfig(), CommandGuardConfig()
+    for words in (
+        f"no command for {1000 * ur.command_timeout:.0f} ms",
+        f"or {ur.patience:g} s (`ur.patience`)",
+        f"frozen for {1000 * ur.measurement_timeout:.0f} ms",
+        f"not seen for {1000 * guard.object_age_limit:.0f} ms",
+        f"not heard of for {1000 * guard.arm_age_limit:.0f} ms",
+        f"watchdog ({ur_stream._WATCHDOG_FREQUENCY:.0f} Hz)",
+    ):
+        assert words in text
+
+
 @pytest.mark.slow
 def test_a_run_over_loopback_decides_as_one_in_process(tmp_path):
     """The real clients, the real protocols, in real time."""
     text = (scenarios_path() / "virtual_lab.yaml").read_text()
-    hardware = tmp_path / "lab.yaml"
-    hardware.write_text(text.replace("127.0.0.2", RUN_HOST))
+    lab_file = tmp_path / "lab.yaml"
+    lab_file.write_text(text.replace("127.0.0.2", RUN_HOST))
     rhp = [sys.executable, "-m", "rhp_drake.cli"]
     lab = subprocess.Popen(
         [*rhp, "lab", "three_boxes", "--host", RUN_HOST],
@@ -172,7 +227,7 @@ def test_a_run_over_loopback_decides_as_one_in_process(tmp_path):
         run = [*rhp, "run", "three_boxes", "--no-meshcat"]
         over_loopback, in_process = tmp_path / "loopback", tmp_path / "in_process"
         subprocess.run(
-            [*run, "--hardware", hardware, "--out", over_loopback], check=True
+            [*run, "--hardware", lab_file, "--out", over_loopback], check=True
         )
         subprocess.run([*run, "--no-realtime", "--out", in_process], check=True)
     finally:

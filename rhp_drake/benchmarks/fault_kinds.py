@@ -150,5 +150,11 @@ FAULT_KINDS: Final = {
     "ours: kill -9, tracker's driver": _stops(
         _signalled(signal.SIGKILL, "natnet"), Fault.STALE_POSE
     ),
+    "ours: robot's driver stalled": _stops(
+        _signalled(signal.SIGSTOP, "ur"), Fault.STALE_MEASUREMENT
+    ),
+    "ours: tracker's driver stalled": _stops(
+        _signalled(signal.SIGSTOP, "natnet"), Fault.STALE_POSE
+    ),
     "ours: kill -9, the loop": _stops(_signalled(signal.SIGKILL, None)),
 }

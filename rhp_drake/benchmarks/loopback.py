@@ -6,7 +6,6 @@ lab through ur_rtde and natnet, in real time.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-import math
 from pathlib import Path
 import time
 from typing import Final
@@ -138,8 +137,7 @@ def _recomputed(policy: Policy, report: RunReport, seed: int) -> int:
         decision = policy.decide(
             record.state, report.goals, stream(seed, "decision", record.index), memory
         )
-        memory = record.decision.memory
-        same += decision.action == record.decision.action and math.isclose(
-            decision.value, record.decision.value, rel_tol=0, abs_tol=0
-        )
+        theirs = record.decision
+        memory = theirs.memory
+        same += (decision.action, decision.value) == (theirs.action, theirs.value)
     return same

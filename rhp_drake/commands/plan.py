@@ -116,6 +116,8 @@ def _plan(
         # No decision has shown a search that failed or was interrupted.
         if drawing is not None and planner.num_begun > shown:
             drawing.show_from(simulator.get_context().get_time())
+        # What comes last, a fault for one.
+        simulator.get_system().ForcedPublish(simulator.get_context())
     if run is None:
         console.print(f"Results: {folder}")
         return 0

@@ -121,22 +121,26 @@ def _run(
     config = load_hardware(hardware_file) if hardware_file is not None else None
     meshcat = task_run.start_meshcat(scenario) if use_meshcat else None
     console = task_run.make_console()
-    with ExitStack() as stack:
-        # Written last, once the arm has been stopped: that takes its time.
-        stack.enter_context(task_run.recorded(meshcat, folder))
-        running = None
-        if config is not None:
-            console.print(f"Connecting to {config.description or hardware_file}")
-            m = len(scenario.station.objects)
-            running = stack.enter_context(running_hardware(config, m))
-        simulator = task_run.make_simulator(
-            scenario, policy, meshcat, realtime, running
-        )
-        make_folder(folder)
-        task_run.say_title(console, title, scenario, meshcat)
-        run = task_run.run_task(
-            simulator, scenario, console, on_hardware=running is not None
-        )
+    with task_run.recorded(meshcat, folder):
+        with ExitStack() as stack:
+            running = None
+            if config is not None:
+                console.print(f"Connecting to {config.description or hardware_file}")
+                m = len(scenario.station.objects)
+                running = stack.enter_context(running_hardware(config, m))
+                if config.lcm is None:
+                    moves = "does not move: dry_run" if config.ur.dry_run else "moves"
+                    console.print(f"The arm {moves}.", style="bold")
+            simulator = task_run.make_simulator(
+                scenario, policy, meshcat, realtime, running
+            )
+            make_folder(folder)
+            task_run.say_title(console, title, scenario, meshcat)
+            run = task_run.run_task(
+                simulator, scenario, console, on_hardware=running is not None
+            )
+        # To draw what comes last takes its time: by now the arm has been stopped.
+        simulator.get_system().ForcedPublish(simulator.get_context())
     task_run.write_run(run, scenario, folder)
     task_run.say_outcome(console, run, folder)
     return run.outcome

@@ -19,7 +19,8 @@ class ArmMeasurement:
         position: Of the joints, base to wrist, shape (6,), rad.
         velocity: Likewise, rad/s.
         fault: Why the arm was stopped, if it was.
-        age: Since the robot measured this, s.
+        age: Since something new was heard of it, s; on its way it may have been for as
+            long again.
     """
 
     position: np.ndarray

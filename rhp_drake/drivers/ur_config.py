@@ -21,7 +21,7 @@ class UrDriverConfig:
             hand rests.
         connection_timeout: How long the robot may take to answer at first, s.
         dry_run: Whether everything is done but moving the arm; it is then said to be
-            where it was commanded to be.
+            where it was commanded to be.  True unless the file says false.
     """
 
     host: str = ""
@@ -32,7 +32,7 @@ class UrDriverConfig:
     measurement_timeout: float = 0.04
     patience: float = 5.0
     connection_timeout: float = 10.0
-    dry_run: bool = False
+    dry_run: bool = True
 
     def validate(self) -> None:
         """Raises an InputError that names the first impossible value."""

@@ -7,8 +7,8 @@ measurements go through shared memory.
 import multiprocessing
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event
+import sys
 import time
-from typing import Final
 import weakref
 
 import numpy as np
@@ -21,13 +21,11 @@ from rhp_drake.drivers.ur_stream import (
     COMMAND_SIZE,
     MEASUREMENT_SIZE,
     NUM_JOINTS,
+    STOP_TIME,
     serve,
 )
 from rhp_drake.errors import InputError
 from rhp_drake.safety import Fault, describe
-
-# How long `stop` waits for the arm to brake.
-_STOP_TIME: Final = 2.0  # s
 
 
 class UrDriver:
@@ -106,7 +104,8 @@ class UrDriver:
                 return str(self._problem.recv()).rstrip("!.")
         except EOFError:
             fault = self.read().fault
-            return f"its driver ended: {describe(fault).rstrip('.')}"
+            why = "" if fault == Fault.NONE else f": {describe(fault).rstrip('.')}"
+            return f"its driver ended{why}"
         return f"no answer within {self._config.connection_timeout:g} s"
 
     def command(self, position: np.ndarray, engaged: bool) -> None:
@@ -147,8 +146,12 @@ class UrDriver:
 def _end(process: BaseProcess, stopping: Event) -> None:
     """Ends the driver's process, in good order if it can."""
     stopping.set()
-    process.join(timeout=_STOP_TIME)
+    process.join(timeout=STOP_TIME)
     if process.is_alive():
-        # The watchdog stops the arm.
+        print(
+            "rhp: the robot's driver did not end and was killed; the controller's "
+            "watchdog stops the arm.",
+            file=sys.stderr,
+        )
         process.kill()
         process.join()

@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.synchronize import Event
 import os
 import signal
+import sys
 from threading import Thread
 import time
 import traceback
@@ -47,6 +48,9 @@ _E_SERIES_PERIOD: Final = 0.002  # s
 # A call of the library that takes so long tries to connect anew, for ever.
 _STUCK_TIME: Final = 1.0  # s
 _WATCH_PERIOD: Final = 0.1  # s
+# How long the arm may take to brake, and the process to end.
+STOP_TIME: Final = 2.0  # s
+_DASHBOARD_TIMEOUT: Final = 500  # ms
 # RTDE guide of Universal Robots: robot and safety modes, and a program that runs.
 _ROBOT_RUNNING: Final = 7
 _SAFETY_NORMAL: Final = (1, 2)  # Normal, reduced.
@@ -105,6 +109,9 @@ def serve(
                 # Before the library uploads its program anew, without a watchdog.
                 os._exit(1)
         stopping.set()
+        # Nobody is left to end what does not end by itself.
+        time.sleep(STOP_TIME)
+        os._exit(1)
 
     Thread(target=watch, daemon=True).start()
     try:
@@ -114,7 +121,13 @@ def serve(
             problem.send(str(error))
             return
         # Only now: the library waits in loops, until the robot answers.
-        ask_for_realtime()
+        if not ask_for_realtime():
+            print(
+                "rhp: no real-time scheduling for the robot's driver: a busy computer "
+                "may stop the arm for nothing (limit rtprio).",
+                file=sys.stderr,
+                flush=True,
+            )
         stream.run(stopping.is_set)
     except Exception:
         # Nothing is sent any more, so that the watchdog stops the arm.
@@ -291,7 +304,11 @@ class Stream:
         if np.isnan(stamp) or not values[0]:
             # Not engaged, or no more: then the next command has to be where the arm is
             # again.  The controller waits for a sign of life all the same.
+            if self._moving:
+                # Let go on its way, it would go on to what was sent last.
+                return Fault.STALE_COMMAND
             self._accepted = self._sent = None
+            self._sent_at = np.nan
             self._slack = self._command_period
             if self._control is not None:
                 self._control.kickWatchdog()
@@ -377,6 +394,7 @@ class Stream:
             return
         # The library waits in a loop until the arm is at rest.
         leave_realtime()
+        self._calling_since = time.monotonic()
         try:
             if self._fault == Fault.NONE or self._fault in _OURS:
                 self._control.servoStop(_DECELERATION)
@@ -385,8 +403,14 @@ class Stream:
                 from dashboard_client import DashboardClient
 
                 dashboard = DashboardClient(self._config.host)
-                dashboard.connect()
+                dashboard.connect(_DASHBOARD_TIMEOUT)
                 dashboard.stop()
-        except RuntimeError:
-            # There is no connection left: the watchdog stops the arm.
-            pass
+        except RuntimeError as error:
+            # The watchdog stops the arm.
+            print(
+                f"rhp: the robot's program could not be ended ({error}): do not resume "
+                "it.",
+                file=sys.stderr,
+                flush=True,
+            )
+        self._calling_since = np.inf

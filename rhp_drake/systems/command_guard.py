@@ -201,11 +201,24 @@ class CommandGuard(LeafSystem):
     def _CheckHand(self, desired: np.ndarray) -> Fault:
         """Whether a command, shape (6,), has the hand upright where it may be."""
         X_WH = self._kinematics.forward_kinematics(desired)
-        margin = self._config.workspace_margin
-        inside = (
-            (X_WH[:2, 3] >= WORKSPACE_LOWER - margin).all()
-            and (X_WH[:2, 3] <= WORKSPACE_UPPER + margin).all()
-            and abs(X_WH[2, 3] - PUSHING_HEIGHT) <= self._config.height_tolerance
-            and X_WH[2, 2] >= _LEAST_UPRIGHT
-        )
+        inside = hand_is_inside(self._config, X_WH)
         return Fault.NONE if inside else Fault.HAND_OUTSIDE
+
+
+def hand_is_inside(
+    config: CommandGuardConfig, X_WH: np.ndarray, rounding: float = 0.0
+) -> bool:
+    """Whether a pose of the hand, shape (4, 4), is upright where the hand may be.
+
+    Args:
+        config: The limits.
+        X_WH: The pose, m.
+        rounding: How much further out it may be, m.
+    """
+    margin = config.workspace_margin + rounding
+    return bool(
+        (X_WH[:2, 3] >= WORKSPACE_LOWER - margin).all()
+        and (X_WH[:2, 3] <= WORKSPACE_UPPER + margin).all()
+        and abs(X_WH[2, 3] - PUSHING_HEIGHT) <= config.height_tolerance + rounding
+        and X_WH[2, 2] >= _LEAST_UPRIGHT - rounding
+    )

@@ -115,6 +115,22 @@ class HandServo(LeafSystem):
             period_sec=COMMAND_PERIOD, offset_sec=0.0, update=self._Update
         )
 
+    def check_start(self, position: np.ndarray) -> None:
+        """Raises an InputError if the hand cannot be moved from where the joints are.
+
+        Args:
+            position: Of the joints, shape (6,), rad.
+        """
+        upright = self._kinematics.inverse_kinematics(
+            self._kinematics.hand_pose(position)
+        )
+        away = np.abs(upright - position).max()
+        if away > JOINT_SPEED * COMMAND_PERIOD:
+            raise InputError(
+                "the hand does not stand upright at its pushing height: a joint is "
+                f"{away:.3f} rad from where it would be.  Move the arm there first."
+            )
+
     def _Initialize(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = latch_position(self._measured_port, context)
         discrete_state.set_value(self._position, measured)

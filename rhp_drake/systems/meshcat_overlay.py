@@ -50,8 +50,8 @@ class MeshcatOverlay(LeafSystem):
     is inside.  Of each roll-out the hand's path is blue and the target's green; the
     roll-out with the highest return is drawn wide and dark.
 
-    After a fault the workspace has a red frame and the background is red, and behind
-    the robot stands why.
+    After a fault the workspace has a red frame and the background is red, and beside
+    the robot stands why.  Only a forced publish draws that.
 
     Recordings keep properties but no new objects.  So each decision gets objects of
     its own, under a path with its number, and only their visibility changes in time.
@@ -84,7 +84,7 @@ class MeshcatOverlay(LeafSystem):
         self._fault = self.DeclareVectorInputPort("fault", 1)
         self.DeclareInitializationPublishEvent(self._PublishDiscs)
         self.DeclarePeriodicPublishEvent(FRAME_PERIOD, 0.0, self._PublishChanges)
-        self.DeclareForcedPublishEvent(self._PublishChanges)
+        self.DeclareForcedPublishEvent(self._PublishAll)
 
     def _PublishDiscs(self, context: Context) -> EventStatus:
         """Draws the goal regions, and forgets the roll-outs of the run before."""
@@ -122,9 +122,17 @@ class MeshcatOverlay(LeafSystem):
         # Meshcat itself remembers what is drawn, so this system needs no state.
         if record.index >= 0 and not self._meshcat.HasPath(_path(record.index)):
             self._ShowRollOuts(record.index, record.decision, time)
+        return EventStatus.Succeeded()
+
+    def _PublishAll(self, context: Context) -> EventStatus:
+        """Shows a fault, too.
+
+        That takes a while, in which a real arm would go on: for when it was stopped.
+        """
+        self._PublishChanges(context)
         fault = Fault(int(self._fault.Eval(context)[0]))
         if fault != Fault.NONE and not self._meshcat.HasPath(_FAULT_PATH):
-            self._ShowFault(fault, time)
+            self._ShowFault(fault, context.get_time())
         return EventStatus.Succeeded()
 
     def _ShowFault(self, fault: Fault, time: float) -> None:

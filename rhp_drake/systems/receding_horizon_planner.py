@@ -258,6 +258,8 @@ class RecedingHorizonPlanner(LeafSystem):
             return episode.ended(Status.OBJECT_FELL, "an object fell off the table.")
         arrived = has_arrived(state[:3], episode.hand_target)
         if not (arrived and self._at_rest_port.Eval(context)[0]):
+            if context.get_time() - episode.sent_time < PATIENCE:
+                return replace(episode, pending=None)
             x, y, angle = np.abs(state[:3] - episode.hand_target)
             problem = (
                 f"the objects have not come to rest within {PATIENCE} s."
@@ -265,10 +267,7 @@ class RecedingHorizonPlanner(LeafSystem):
                 else f"after {PATIENCE} s the hand is still "
                 f"{1000 * np.hypot(x, y):.1f} mm and {angle:.3f} rad from its target."
             )
-            late = context.get_time() - episode.sent_time >= PATIENCE
-            if late:
-                return episode.ended(Status.TIMED_OUT, problem)
-            return replace(episode, pending=None)
+            return episode.ended(Status.TIMED_OUT, problem)
         return self._AtRest(context, episode, state, goals)
 
     def _AtRest(
