@@ -26,11 +26,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from rhp_drake.drivers.command_follower import CommandFollower
 from rhp_drake.drivers.command_periods import CommandPeriods
 from rhp_drake.drivers.realtime import ask_for_realtime, leave_realtime
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
-from rhp_drake.safety import Fault, check_command
+from rhp_drake.drivers.ur_modes import PROGRAM_RUNNING, check_robot
+from rhp_drake.safety import Fault
 
 NUM_JOINTS: Final = 6
 
@@ -51,19 +53,6 @@ _WATCH_PERIOD: Final = 0.1  # s
 # How long the arm may take to brake, and the process to end.
 STOP_TIME: Final = 2.0  # s
 _DASHBOARD_TIMEOUT: Final = 500  # ms
-# RTDE guide of Universal Robots: robot and safety modes, and a program that runs.
-_ROBOT_RUNNING: Final = 7
-_SAFETY_NORMAL: Final = (1, 2)  # Normal, reduced.
-_SAFETY_PROTECTIVE: Final = (3, 4)  # Protective stop, recovery.
-_ROBOT_MODES: Final = range(-1, 10)
-_SAFETY_MODES: Final = range(1, 12)
-_PROGRAM_RUNNING: Final = 2
-# rad from command to command: slower than this is rounding, not motion.
-_STILL: Final = 1e-5
-# No joint of a UR robot turns further (360 degrees and a little), or twice as fast as
-# the fastest does.
-_POSSIBLE_POSITION: Final = 6.5  # rad
-_POSSIBLE_VELOCITY: Final = 12.6  # rad/s
 _VARIABLES: Final = [
     "timestamp",
     "actual_q",
@@ -149,7 +138,6 @@ class Stream:
         periods: SharedVector,
     ) -> None:
         self._config = config
-        self._command_period = command_period
         self._commands = commands
         self._measurements = measurements
         self._shared_periods = periods
@@ -157,20 +145,11 @@ class Stream:
         self._receive: Any = None
         self._control: Any = None
         self._period = command_period
-        # The newest command that was accepted, shape (6,), and whether it differs from
-        # the one before; when it was, and when it was written; what had been sent by
-        # then, shape (6,).  None until the arm is engaged.
-        self._accepted: np.ndarray | None = None
-        self._moving = False
-        self._accepted_at = np.nan
+        self._follower = CommandFollower(config, command_period)
+        # When the newest command was written that was looked at.
         self._stamp = np.nan
-        self._before: np.ndarray | None = None
-        # What was sent last, shape (6,).
-        self._sent: np.ndarray | None = None
         # Whether the robot did not take what was sent last.
         self._refused = False
-        # How much later than due the newest command may have come, s.
-        self._slack = command_period
         self._periods = CommandPeriods()
         self._sent_at = np.nan
         # When the call of the library began that has not returned, s; else inf.
@@ -215,8 +194,8 @@ class Stream:
             new_fault = fault != self._fault == Fault.NONE
             if new_fault:
                 self._fault = fault
-            if self._config.dry_run and self._accepted is not None:
-                position = self._accepted
+            if self._config.dry_run and self._follower.accepted is not None:
+                position = self._follower.accepted
             # A frozen stream looks old, whatever is read from it.
             rest = [heard_at, self._fault]
             self._measurements.write(np.concatenate([position, velocity, rest]))
@@ -269,31 +248,14 @@ class Stream:
             return Fault.CONNECTION_LOST
         if age > self._config.measurement_timeout:
             return Fault.STALE_MEASUREMENT
-        return self._check_modes(position, velocity)
-
-    def _check_modes(self, position: np.ndarray, velocity: np.ndarray) -> Fault:
-        """What a robot that is heard of says of itself."""
-        receive = self._receive
-        safety, mode = receive.getSafetyMode(), receive.getRobotMode()
-        # Written so that nan is impossible, too.
-        possible = (
-            (np.abs(position) <= _POSSIBLE_POSITION).all()
-            and (np.abs(velocity) <= _POSSIBLE_VELOCITY).all()
-            and safety in _SAFETY_MODES
-            and mode in _ROBOT_MODES
+        program = receive.getRuntimeState()
+        return check_robot(
+            position,
+            velocity,
+            receive.getRobotMode(),
+            receive.getSafetyMode(),
+            program_runs=control is None or program == PROGRAM_RUNNING,
         )
-        if not possible:
-            return Fault.IMPLAUSIBLE_MEASUREMENT
-        if safety in _SAFETY_PROTECTIVE:
-            return Fault.PROTECTIVE_STOP
-        if safety not in _SAFETY_NORMAL:
-            return Fault.EMERGENCY_STOP
-        program_runs = (
-            self._control is None or receive.getRuntimeState() == _PROGRAM_RUNNING
-        )
-        if mode != _ROBOT_RUNNING or not program_runs:
-            return Fault.NOT_RUNNING
-        return Fault.NONE
 
     def _follow(self, measured: np.ndarray, now: float) -> Fault:
         """Takes the newest command, if it is safe, and goes there."""
@@ -304,76 +266,37 @@ class Stream:
         if np.isnan(stamp) or not values[0]:
             # Not engaged, or no more: then the next command has to be where the arm is
             # again.  The controller waits for a sign of life all the same.
-            if self._moving:
+            if self._follower.moving:
                 # Let go on its way, it would go on to what was sent last.
                 return Fault.STALE_COMMAND
-            self._accepted = self._sent = None
+            self._follower.let_go()
             self._sent_at = np.nan
-            self._slack = self._command_period
             if self._control is not None:
                 self._control.kickWatchdog()
             return Fault.NONE
         if stamp != self._stamp:
-            fault = self._accept(values[1:], measured, now)
+            fault = self._follower.accept(values[1:], measured, now)
             if fault != Fault.NONE:
                 return fault
             self._stamp = stamp
         config = self._config
-        limit = config.command_timeout if self._moving else config.patience
+        moving = self._follower.moving
+        limit = config.command_timeout if moving else config.patience
         if now - stamp > limit:
             return Fault.STALE_COMMAND
         return self._send(now)
 
-    def _accept(self, desired: np.ndarray, measured: np.ndarray, now: float) -> Fault:
-        """Checks a new command and makes it the one to follow."""
-        config, previous = self._config, self._accepted
-        # The first command has to be where the arm is.
-        accepted = measured if previous is None else previous
-        # After a long rest, too, the arm must not be sent far away at once.
-        elapsed = now - self._accepted_at if previous is not None else 0.0
-        # The commands' clock and this one may be a command apart, but no more: what a
-        # command takes beyond its time, the next ones lack.
-        allowed = min(elapsed, config.command_timeout) + self._slack
-        fault = check_command(
-            config.limits,
-            allowed,
-            desired,
-            accepted,
-            accepted if config.dry_run else measured,
-        )
-        if fault == Fault.NONE:
-            taken = np.abs(desired - accepted).max() / config.limits.velocity_limit
-            self._slack = min(allowed - taken, self._command_period)
-            self._moving = (
-                previous is not None and np.abs(desired - previous).max() > _STILL
-            )
-            self._before = desired if self._sent is None else self._sent
-            self._accepted, self._accepted_at = desired, now
-        return fault
-
     def _send(self, now: float) -> Fault:
-        """Sends where the arm is to be by now, on a straight line to the command.
-
-        What is sent never goes faster than the limit, also after commands that came
-        late or were missed.
-        """
-        assert self._accepted is not None
-        assert self._before is not None
+        """Sends where the arm is to be by now."""
         if not np.isnan(self._sent_at):
             self._periods.add(now - self._sent_at)
             self._shared_periods.write(self._periods.vector)
         self._sent_at = now
-        # A controller that is faster than the commands gets several points of the line.
-        share = (now - self._accepted_at + self._period) / self._command_period
-        position = self._before + min(share, 1.0) * (self._accepted - self._before)
-        sent = position if self._sent is None else self._sent
-        step = position - sent
-        longest = self._config.limits.velocity_limit * self._period
-        self._sent = sent + step * min(1.0, longest / max(np.abs(step).max(), longest))
+        position = self._follower.next_position(now, self._period)
         if self._control is None:
             return Fault.NONE
         self._refused = not self._control.servoJ(
-            self._sent.tolist(),
+            position.tolist(),
             _UNUSED,
             _UNUSED,
             self._period,
