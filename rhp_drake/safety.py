@@ -13,7 +13,7 @@ import numpy as np
 
 from rhp_drake.errors import InputError
 
-_NUM_JOINTS: Final = 6
+NUM_JOINTS: Final = 6
 # What the arm itself can do, rad and rad/s, and half a radian, which is as good as
 # lost: more would limit nothing.
 _LARGEST_POSITION: Final = math.tau
@@ -89,10 +89,10 @@ class JointLimits:
 
     def validate(self) -> None:
         """Raises an InputError if a limit is impossible, or no limit at all."""
-        if len(self.position_limits) != _NUM_JOINTS:
+        if len(self.position_limits) != NUM_JOINTS:
             raise InputError(
                 f"position_limits: {self.position_limits}; there must be "
-                f"{_NUM_JOINTS} positive ones."
+                f"{NUM_JOINTS} positive ones."
             )
         for name, values, largest in (
             ("position_limits", self.position_limits, _LARGEST_POSITION),

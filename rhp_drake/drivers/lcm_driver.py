@@ -23,7 +23,7 @@ from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.drivers.rhp_lcm import lcmt_ur_command
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.errors import WorkError
-from rhp_drake.safety import Fault, describe
+from rhp_drake.safety import NUM_JOINTS, Fault, describe
 
 if TYPE_CHECKING:
     from pydrake.lcm import DrakeLcmInterface
@@ -63,7 +63,7 @@ class LcmArm:
     def let_go(self) -> None:
         """Says that the arm is to follow no more, if it does."""
         if self._engaged:
-            self.command(np.full(6, np.nan), engaged=False)
+            self.command(np.full(NUM_JOINTS, np.nan), engaged=False)
 
     def read(self) -> ArmMeasurement:
         """The newest measurement; its numbers are nan before the first.
@@ -72,9 +72,11 @@ class LcmArm:
         """
         values, stamp = self._status.read()
         if math.isnan(stamp):
-            nan = np.full(6, np.nan)
+            nan = np.full(NUM_JOINTS, np.nan)
             return ArmMeasurement(nan, nan, Fault.NONE, math.inf)
-        position, velocity, (fault, measured) = np.split(values, [6, 12])
+        position, velocity, (fault, measured) = np.split(
+            values, [NUM_JOINTS, 2 * NUM_JOINTS]
+        )
         return ArmMeasurement(
             position,
             velocity,

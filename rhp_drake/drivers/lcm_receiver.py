@@ -8,6 +8,7 @@ from rhp_drake.drivers.lcm_config import POSES_CHANNEL, STATUS_CHANNEL, LcmConfi
 from rhp_drake.drivers.lcm_inbox import Inbox
 from rhp_drake.drivers.rhp_lcm import lcmt_object_poses, lcmt_ur_status
 from rhp_drake.drivers.shared_memory import SharedVector
+from rhp_drake.safety import NUM_JOINTS
 from rhp_drake.workers import follow_parent
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ _NORM_TOLERANCE: Final = 1e-3
 
 # Layout of the shared vectors.
 # q, qd, fault, when they were measured (time.monotonic).
-STATUS_SIZE: Final = 6 + 6 + 2
+STATUS_SIZE: Final = 2 * NUM_JOINTS + 2
 # Of each object: position (m), quaternion (w, x, y, z), when it was seen.
 POSE_SIZE: Final = 3 + 4 + 1
 

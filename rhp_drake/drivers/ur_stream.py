@@ -32,9 +32,7 @@ from rhp_drake.drivers.realtime import ask_for_realtime, leave_realtime
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.drivers.ur_modes import PROGRAM_RUNNING, check_robot
-from rhp_drake.safety import Fault
-
-NUM_JOINTS: Final = 6
+from rhp_drake.safety import NUM_JOINTS, Fault
 
 # ur_rtde ignores speed and acceleration of servoJ, but checks their ranges.
 _UNUSED: Final = 0.5

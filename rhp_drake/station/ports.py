@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from rhp_drake.safety import NUM_JOINTS
+
 if TYPE_CHECKING:
     from pydrake.systems.framework import System
 
@@ -15,7 +17,6 @@ JOINT_NAMES: Final = (
     "wrist_2_joint",
     "wrist_3_joint",
 )
-NUM_JOINTS: Final = len(JOINT_NAMES)
 # A UR5 of the CB3 series takes one command every 8 ms.
 COMMAND_PERIOD: Final = 0.008  # s
 
