@@ -4,11 +4,8 @@
 """
 
 import math
-import multiprocessing
-from multiprocessing.process import BaseProcess
 import time
 from typing import TYPE_CHECKING, Final
-import weakref
 
 import numpy as np
 
@@ -20,6 +17,7 @@ from rhp_drake.drivers.lcm_config import (
 )
 from rhp_drake.drivers.lcm_receiver import POSE_SIZE, STATUS_SIZE, receive
 from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
+from rhp_drake.drivers.receiver_process import ReceiverProcess
 from rhp_drake.drivers.rhp_lcm import lcmt_ur_command
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.errors import WorkError
@@ -136,7 +134,7 @@ class LcmDriver:
         params = DrakeLcmParams(lcm_url=config.url, defer_initialization=True)
         self.arm = LcmArm(DrakeLcm(params), self._status)
         self.tracker = LcmTracker(self._poses)
-        self._end: weakref.finalize | None = None
+        self._process = ReceiverProcess("LCM", receive)
 
     def start(self) -> None:
         """Starts to receive, and waits until robot and objects have been heard of.
@@ -146,29 +144,13 @@ class LcmDriver:
                 fault.
             RuntimeError: If it was started before.
         """
-        if self._end is not None:
-            raise RuntimeError("the LCM driver is running.")
-        # Drake and torch start threads, which a forked child would inherit broken.
-        process = multiprocessing.get_context("spawn").Process(
-            target=receive,
-            args=(self._config, self._status, self._poses),
-            name="lcm",
-            daemon=True,
-        )
-        process.start()
-        self._end = weakref.finalize(self, _kill, process)
-        try:
-            self._WaitForAll()
-        except BaseException:  # Ctrl-C, too.
-            self.stop()
-            raise
+        self._process.start((self._config, self._status, self._poses), self._WaitForAll)
 
     def stop(self) -> None:
         """Lets the arm go, and ends the process, if it runs."""
-        if self._end is not None:
+        if self._process.is_running:
             self.arm.let_go()
-            self._end()
-            self._end = None
+        self._process.stop()
 
     def _WaitForAll(self) -> None:
         give_up_at = time.monotonic() + _START_TIME
@@ -198,9 +180,3 @@ class LcmDriver:
             if math.isinf(pose.age)
         ]
         return f"{POSES_CHANNEL} of {', '.join(unseen)}" if unseen else ""
-
-
-def _kill(process: BaseProcess) -> None:
-    """Ends a process that has nothing to save, and waits until it has ended."""
-    process.kill()
-    process.join()

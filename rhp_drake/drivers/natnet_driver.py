@@ -8,10 +8,8 @@ import importlib.util
 import math
 import multiprocessing
 from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
 import time
 from typing import TYPE_CHECKING, Final
-import weakref
 
 import numpy as np
 
@@ -26,6 +24,7 @@ from rhp_drake.drivers.natnet_receiver import (
     TRACKED,
     receive,
 )
+from rhp_drake.drivers.receiver_process import ReceiverProcess
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.errors import InputError, WorkError
 
@@ -82,7 +81,7 @@ class NatNetDriver:
         self._X_WO = config.X_WO.to_transform()
         self._X_RB = [config.X_RB.get(x, PoseConfig()).to_transform() for x in names]
         self._vector = SharedVector(len(names) * NUM_COLUMNS + 1)
-        self._end: weakref.finalize | None = None
+        self._process = ReceiverProcess("NatNet", receive)
 
     def start(self) -> None:
         """Starts to receive, and waits until Motive has named its rigid bodies.
@@ -93,36 +92,22 @@ class NatNetDriver:
             WorkError: If Motive does not answer within seconds.
             RuntimeError: If the driver is running.
         """
-        if self._end is not None:
-            raise RuntimeError("the NatNet driver is running.")
         if importlib.util.find_spec("natnet") is None:
             raise InputError(
                 "OptiTrack needs natnet: pip install -c constraints.txt "
                 '-e ".[hardware]".'
             )
-        # Drake and torch start threads, which a forked child would inherit broken.
-        context = multiprocessing.get_context("spawn")
-        answer, sender = context.Pipe(duplex=False)
-        process = context.Process(
-            target=receive,
-            args=(self._config, self._vector, sender),
-            name="natnet",
-            daemon=True,
-        )
-        process.start()
-        self._end = weakref.finalize(self, _kill, process)
-        sender.close()  # Else the pipe does not end with the process.
-        try:
+        answer, sender = multiprocessing.Pipe(duplex=False)
+
+        def wait() -> None:
+            sender.close()  # Else the pipe does not end with the process.
             _check_answer(answer)
-        except BaseException:  # Ctrl-C, too.
-            self.stop()
-            raise
+
+        self._process.start((self._config, self._vector, sender), wait)
 
     def stop(self) -> None:
         """Ends the process, if it runs; `read` returns what it left."""
-        if self._end is not None:
-            self._end()
-            self._end = None
+        self._process.stop()
 
     def read(self) -> list[TrackedPose]:
         """What is known of each box now, in the order of `bodies`; does not wait."""
@@ -170,9 +155,3 @@ def _check_answer(answer: Connection) -> None:
             raise WorkError("the NatNet driver's process died at its start.") from None
     if error is not None:
         raise error
-
-
-def _kill(process: BaseProcess) -> None:
-    """Ends a process that has nothing to save, and waits until it has ended."""
-    process.kill()
-    process.join()
