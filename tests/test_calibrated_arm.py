@@ -11,8 +11,7 @@ import pytest
 
 from rhp_drake import hardware
 from rhp_drake.closed_loop import AddRobot, Hardware
-from rhp_drake.drivers.measurements import ArmMeasurement
-from rhp_drake.drivers.natnet_driver import TrackedPose
+from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.errors import InputError
 from rhp_drake.safety import Fault
 from rhp_drake.scenario import Scenario
@@ -62,8 +61,7 @@ class Table:
 
     def read(self):
         return [
-            TrackedPose(RigidTransform([0.7, y, 0.03]), 0.004, tracked=True, frame=1)
-            for y in (-0.2, 0.0, 0.2)
+            ObjectPose(RigidTransform([0.7, y, 0.03]), 0.004) for y in (-0.2, 0.0, 0.2)
         ]
 
 

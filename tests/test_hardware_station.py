@@ -11,8 +11,7 @@ from pydrake.systems.framework import EventStatus
 import pytest
 
 from rhp_drake.closed_loop import Hardware, MakeClosedLoop, MakeStation
-from rhp_drake.drivers.measurements import ArmMeasurement
-from rhp_drake.drivers.natnet_driver import TrackedPose
+from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.errors import InputError
 from rhp_drake.planning.policy import Decision
 from rhp_drake.run_closed_loop import run_on_hardware
@@ -54,12 +53,7 @@ class Table:
 
     def read(self):
         return [
-            TrackedPose(
-                RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, 0.03]),
-                age=age,
-                tracked=True,
-                frame=1,
-            )
+            ObjectPose(RigidTransform(RollPitchYaw(0, 0, yaw), [x, y, 0.03]), age)
             for (x, y, yaw), age in zip(BOXES, self.ages, strict=True)
         ]
 

@@ -21,8 +21,9 @@ from rhp_drake.drivers.lcm_config import (
 )
 from rhp_drake.drivers.lcm_driver import LcmArm, LcmDriver, LcmTracker
 from rhp_drake.drivers.lcm_inbox import SenderClock
-from rhp_drake.drivers.lcm_receiver import POSE_SIZE, STATUS_SIZE, Receiver
+from rhp_drake.drivers.lcm_receiver import STATUS_SIZE, Receiver
 from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
+from rhp_drake.drivers.pose_rows import POSE_SIZE
 from rhp_drake.drivers.rhp_lcm import (
     lcmt_object_poses,
     lcmt_ur_command,

@@ -15,8 +15,9 @@ from rhp_drake.drivers.lcm_config import (
     STATUS_CHANNEL,
     LcmConfig,
 )
-from rhp_drake.drivers.lcm_receiver import POSE_SIZE, STATUS_SIZE, receive
+from rhp_drake.drivers.lcm_receiver import STATUS_SIZE, receive
 from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
+from rhp_drake.drivers.pose_rows import POSE_SIZE, to_poses
 from rhp_drake.drivers.receiver_process import ReceiverProcess
 from rhp_drake.drivers.rhp_lcm import lcmt_ur_command
 from rhp_drake.drivers.shared_memory import SharedVector
@@ -95,19 +96,8 @@ class LcmTracker:
 
     def read(self) -> list[ObjectPose]:
         """What is known of each object now, in the order of `LcmConfig.objects`."""
-        from pydrake.common.eigen_geometry import Quaternion
-        from pydrake.math import RigidTransform
-
-        now = time.monotonic()
-        poses = []
-        for row in self._poses.read()[0].reshape(-1, POSE_SIZE):
-            position, quaternion, seen = row[:3], row[3:7], row[7]
-            if math.isnan(seen):
-                poses.append(ObjectPose(RigidTransform(np.full(3, np.nan)), math.inf))
-                continue
-            rotation = Quaternion(quaternion / np.linalg.norm(quaternion))
-            poses.append(ObjectPose(RigidTransform(rotation, position), now - seen))
-        return poses
+        rows = self._poses.read()[0].reshape(-1, POSE_SIZE)
+        return to_poses(rows, time.monotonic())
 
 
 class LcmDriver:

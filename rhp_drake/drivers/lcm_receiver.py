@@ -6,6 +6,7 @@ import numpy as np
 
 from rhp_drake.drivers.lcm_config import POSES_CHANNEL, STATUS_CHANNEL, LcmConfig
 from rhp_drake.drivers.lcm_inbox import Inbox
+from rhp_drake.drivers.pose_rows import NORM_TOLERANCE, POSE_SIZE
 from rhp_drake.drivers.rhp_lcm import lcmt_object_poses, lcmt_ur_status
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.safety import NUM_JOINTS
@@ -14,13 +15,8 @@ from rhp_drake.workers import follow_parent
 if TYPE_CHECKING:
     from pydrake.lcm import DrakeLcmInterface
 
-_NORM_TOLERANCE: Final = 1e-3
-
-# Layout of the shared vectors.
-# q, qd, fault, when they were measured (time.monotonic).
+# Layout of the shared vector: q, qd, fault, when they were measured (time.monotonic).
 STATUS_SIZE: Final = 2 * NUM_JOINTS + 2
-# Of each object: position (m), quaternion (w, x, y, z), when it was seen.
-POSE_SIZE: Final = 3 + 4 + 1
 
 
 def receive(config: LcmConfig, status: SharedVector, poses: SharedVector) -> None:
@@ -101,7 +97,7 @@ def _check_poses(message: lcmt_object_poses) -> None:
         raise ValueError("a position is not finite")
     for quaternion in message.quaternion:
         # Written so that nan is refused, too.
-        if not abs(np.linalg.norm(quaternion) - 1) <= _NORM_TOLERANCE:
+        if not abs(np.linalg.norm(quaternion) - 1) <= NORM_TOLERANCE:
             raise ValueError("a quaternion is not of length 1")
     if any(utime > message.utime for utime in message.measured_utime):
         raise ValueError("an object was seen after it was sent")

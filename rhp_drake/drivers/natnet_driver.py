@@ -3,51 +3,27 @@
 `natnet_receiver` is what its process does.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 import importlib.util
 import math
 import multiprocessing
 from multiprocessing.connection import Connection
 import time
-from typing import TYPE_CHECKING, Final
-
-import numpy as np
+from typing import Final
 
 from rhp_drake.drivers.measurements import ObjectPose
 from rhp_drake.drivers.natnet_config import NatNetConfig, PoseConfig, listed
 from rhp_drake.drivers.natnet_receiver import (
-    FRAME,
-    NUM_COLUMNS,
-    POSE,
     START_TIME,
-    TIME,
-    TRACKED,
     receive,
 )
+from rhp_drake.drivers.pose_rows import POSE_SIZE, to_poses
 from rhp_drake.drivers.receiver_process import ReceiverProcess
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.errors import InputError, WorkError
 
-if TYPE_CHECKING:
-    from pydrake.math import RigidTransform
-
 # How long `start` waits for the driver's process to run, on a machine that may be busy.
 _SPAWN_TIME: Final = 60.0  # s
-
-
-@dataclass(frozen=True)
-class TrackedPose(ObjectPose):
-    """What is known of one box; its pose is that of the last frame that tracked it.
-
-    Its age also grows when no frames come.
-
-    Attributes:
-        tracked: Whether it was tracked in the last frame that came.
-        frame: Motive's number of the frame that X_WB is of; -1 if there is none.
-    """
-
-    tracked: bool
-    frame: int
 
 
 class NatNetDriver:
@@ -80,7 +56,7 @@ class NatNetDriver:
         self._config = config
         self._X_WO = config.X_WO.to_transform()
         self._X_RB = [config.X_RB.get(x, PoseConfig()).to_transform() for x in names]
-        self._vector = SharedVector(len(names) * NUM_COLUMNS + 1)
+        self._vector = SharedVector(len(names) * POSE_SIZE + 1)
         self._process = ReceiverProcess("NatNet", receive)
 
     def start(self) -> None:
@@ -109,13 +85,18 @@ class NatNetDriver:
         """Ends the process, if it runs; `read` returns what it left."""
         self._process.stop()
 
-    def read(self) -> list[TrackedPose]:
-        """What is known of each box now, in the order of `bodies`; does not wait."""
-        rows = self._vector.read()[0][:-1].reshape(-1, NUM_COLUMNS)
-        now = time.monotonic()
+    def read(self) -> list[ObjectPose]:
+        """What is known of each box now, in the order of `bodies`; does not wait.
+
+        A pose is that of the last frame that tracked the box, and ages also when no
+        frames come.
+        """
+        rows = self._vector.read()[0][:-1].reshape(-1, POSE_SIZE)
+        # Motive's: X_OR rather than X_WB.
+        poses = to_poses(rows, time.monotonic())
         return [
-            self._Convert(row, X_RB, now)
-            for row, X_RB in zip(rows, self._X_RB, strict=True)
+            replace(pose, X_WB=self._X_WO @ pose.X_WB @ X_RB)
+            for pose, X_RB in zip(poses, self._X_RB, strict=True)
         ]
 
     @property
@@ -123,25 +104,6 @@ class NatNetDriver:
         """How many datagrams could not be read since `start`."""
         count = self._vector.read()[0][-1]
         return int(count) if math.isfinite(count) else 0
-
-    def _Convert(
-        self, row: np.ndarray, X_RB: "RigidTransform", now: float
-    ) -> TrackedPose:
-        # Drake is imported late: the driver's process does without.
-        from pydrake.common.eigen_geometry import Quaternion
-        from pydrake.math import RigidTransform
-
-        if math.isnan(row[TIME]):
-            nowhere = RigidTransform(np.full(3, np.nan))
-            return TrackedPose(nowhere, age=math.inf, tracked=False, frame=-1)
-        x, y, z, qx, qy, qz, qw = row[POSE]
-        X_OR = RigidTransform(Quaternion(w=qw, x=qx, y=qy, z=qz), [x, y, z])
-        return TrackedPose(
-            X_WB=self._X_WO @ X_OR @ X_RB,
-            age=float(now - row[TIME]),
-            tracked=bool(row[TRACKED]),
-            frame=int(row[FRAME]),
-        )
 
 
 def _check_answer(answer: Connection) -> None:

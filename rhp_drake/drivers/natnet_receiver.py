@@ -4,12 +4,14 @@ from contextlib import redirect_stdout
 import math
 from multiprocessing.connection import Connection
 import os
+import sys
 import time
 from typing import Any, Final
 
 import numpy as np
 
 from rhp_drake.drivers.natnet_config import NatNetConfig, listed
+from rhp_drake.drivers.pose_rows import NORM_TOLERANCE, POSE_SIZE
 from rhp_drake.drivers.realtime import ask_for_realtime
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.errors import InputError, WorkError
@@ -30,16 +32,6 @@ _DEFINITIONS_PERIOD: Final = 1.0  # s
 # A frame this little older than the last is that one again or comes late.  One much
 # older is of a server that counts anew.
 _LATE_FRAMES: Final = 120
-# The quaternions come as float32, of precision 1e-7.
-_NORM_TOLERANCE: Final = 1e-3
-
-# What the driver's process publishes of each rigid body, as columns...
-POSE: Final = slice(0, 7)  # Position (m) and quaternion (x, y, z, w).
-TRACKED: Final = 7  # 0 or 1, in the last frame.
-TIME: Final = 8  # s, time.monotonic: when it was last tracked.
-FRAME: Final = 9  # Number of the frame in which it was.
-NUM_COLUMNS: Final = 10
-# ...before the number of malformed datagrams.
 
 
 def _make_natnet_doubt_counts() -> None:
@@ -78,7 +70,8 @@ class _Receiver:
 
     Args:
         config: Where and what.
-        vector: Where to publish.
+        vector: Where to publish each body's X_OR, as a row, and after all rows the
+            number of malformed datagrams; size m * POSE_SIZE + 1.
         answer: Where to send, once, whether the start went well: None or an error.
     """
 
@@ -88,7 +81,7 @@ class _Receiver:
         self._config = config
         self._vector = vector
         self._answer: Connection | None = answer
-        self._rows = np.full((len(config.bodies), NUM_COLUMNS), np.nan)
+        self._rows = np.full((len(config.bodies), POSE_SIZE), np.nan)
         self._num_malformed = 0
         self._row_of_id: dict[int, int] = {}
         self._last_number = -math.inf
@@ -155,9 +148,12 @@ class _Receiver:
                 emptied_next = now
             except OSError:
                 raise
-            except Exception:
+            except Exception as error:
                 # Of many kinds, by what is malformed; the next update goes on after it.
                 self._num_malformed += 1
+                if self._num_malformed == 1:
+                    text = f"rhp: a datagram of Motive's is dropped: {error}."
+                    print(text, file=sys.stderr, flush=True)
                 emptied_next = emptied
                 self._Publish()
             while self._definitions:
@@ -197,19 +193,17 @@ class _Receiver:
         if self._last_number - _LATE_FRAMES < number <= self._last_number:
             return False
         self._last_number = number
-        self._rows[:, TRACKED] = 0
         for body in frame.rigid_bodies:
             row = self._row_of_id.get(body.id_num)
-            pose = np.array([*body.pos, *body.rot])
-            norm = np.linalg.norm(pose[3:])
+            x, y, z, w = body.rot
+            pose = [*body.pos, w, x, y, z]
             if (
                 row is not None
                 and body.tracking_valid
                 and np.isfinite(pose).all()
-                and abs(norm - 1) <= _NORM_TOLERANCE
+                and abs(np.linalg.norm(body.rot) - 1) <= NORM_TOLERANCE
             ):
-                pose[3:] /= norm
-                self._rows[row] = [*pose, 1, received, number]
+                self._rows[row] = [*pose, received]
         return True
 
     def _Publish(self) -> None:
