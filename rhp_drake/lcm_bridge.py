@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rhp_drake.drivers.lcm_config import COMMAND_CHANNEL, POSES_CHANNEL, STATUS_CHANNEL
-from rhp_drake.drivers.lcm_inbox import Inbox, SenderClock
+from rhp_drake.drivers.lcm_inbox import Inbox, SenderClock, utime
 from rhp_drake.drivers.rhp_lcm import (
     lcmt_object_poses,
     lcmt_ur_command,
@@ -50,9 +50,7 @@ class LcmBridge:
         self._objects = objects
         self._max_age = max_age
         self._due = time.monotonic()
-        self._inbox = Inbox(
-            lcm, COMMAND_CHANNEL, lcmt_ur_command, lambda command: None, self._Take
-        )
+        self._inbox = Inbox(lcm, COMMAND_CHANNEL, lcmt_ur_command, self._Take)
 
     def step(self) -> Fault:
         """Passes commands on for one period, and tells, once, what is measured.
@@ -60,9 +58,10 @@ class LcmBridge:
         Returns:
             The arm's fault.
         """
-        self._lcm.HandleSubscriptions(timeout_millis=0)
-        while (left := self._due - time.monotonic()) > 0:
-            self._lcm.HandleSubscriptions(timeout_millis=math.ceil(1000 * left))
+        left = math.inf
+        while left > 0:
+            left = self._due - time.monotonic()
+            self._lcm.HandleSubscriptions(max(0, math.ceil(1000 * left)))
         # Late once, it is not early afterwards.
         self._due = max(self._due + COMMAND_PERIOD, time.monotonic())
         self._PublishPoses()
@@ -78,11 +77,10 @@ class LcmBridge:
             self._inbox.clock = SenderClock()
 
     def _PublishStatus(self) -> Fault:
-        utime = _utime()
-        measured = self._arm.read()
         message = lcmt_ur_status()
-        message.utime = utime
-        message.measured_utime = _measured_utime(utime, measured.age)
+        message.utime = utime()
+        measured = self._arm.read()
+        message.measured_utime = _measured_utime(message.utime, measured.age)
         message.joint_position_measured = list(measured.position)
         message.joint_velocity_estimated = list(measured.velocity)
         message.fault = int(measured.fault)
@@ -91,7 +89,7 @@ class LcmBridge:
 
     def _PublishPoses(self) -> None:
         message = lcmt_object_poses()
-        message.utime = _utime()
+        message.utime = utime()
         for name, pose in zip(self._objects, self._tracker.read(), strict=True):
             if math.isinf(pose.age):
                 continue
@@ -103,14 +101,9 @@ class LcmBridge:
         self._lcm.Publish(POSES_CHANNEL, message.encode())
 
 
-def _utime() -> int:
-    """Now, microseconds of a clock that never goes back."""
-    return int(time.monotonic() * 1e6)
-
-
-def _measured_utime(utime: int, age: float) -> int:
-    """When that was measured which, just after `utime`, is `age` s old.
+def _measured_utime(sent: int, age: float) -> int:
+    """When that was measured which, just after it is `sent`, is `age` s old.
 
     If anything it was later.
     """
-    return utime - max(0, math.ceil(age * 1e6))
+    return sent - max(0, math.ceil(age * 1e6))

@@ -15,6 +15,7 @@ from rhp_drake.drivers.lcm_config import (
     STATUS_CHANNEL,
     LcmConfig,
 )
+from rhp_drake.drivers.lcm_inbox import utime
 from rhp_drake.drivers.lcm_receiver import STATUS_SIZE, receive
 from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.drivers.pose_rows import POSE_SIZE, to_poses
@@ -53,7 +54,7 @@ class LcmArm:
             engaged: Whether the arm is to follow.
         """
         message = lcmt_ur_command()
-        message.utime = int(time.monotonic() * 1e6)
+        message.utime = utime()
         message.engaged = engaged
         message.joint_position = list(position)
         self._lcm.Publish(COMMAND_CHANNEL, message.encode())

@@ -14,6 +14,11 @@ if TYPE_CHECKING:
 _DRIFT: Final = 2e-4
 
 
+def utime() -> int:
+    """Now, for what is sent: microseconds of a clock that never goes back."""
+    return int(time.monotonic() * 1e6)
+
+
 class SenderClock:
     """Tells when something happened on another computer, by its own stamps.
 
@@ -57,8 +62,8 @@ class Inbox:
         lcm: Calls, in `HandleSubscriptions`.
         channel: Its name.
         message_type: A class that lcm-gen made, with a `utime`.
-        check: Raises a ValueError if a message makes no sense.
         take: Called with each message that is left.
+        check: Raises a ValueError if a message makes no sense; all do by default.
     """
 
     def __init__(
@@ -66,8 +71,8 @@ class Inbox:
         lcm: "DrakeLcmInterface",
         channel: str,
         message_type: Any,
-        check: Callable[[Any], None],
         take: Callable[[Any], None],
+        check: Callable[[Any], None] = lambda message: None,
     ) -> None:
         self.clock = SenderClock()
         self._channel = channel

@@ -1,4 +1,9 @@
-"""The process of the LCM driver: what receives status and poses."""
+"""The process of the LCM driver: what receives status and poses.
+
+It is one of its own because `HandleSubscriptions` holds the interpreter's lock while it
+waits, and because a subscription's queue keeps one message, the oldest: whoever looks
+seldom sees what is old.
+"""
 
 from typing import TYPE_CHECKING, Final
 
@@ -51,10 +56,10 @@ class Receiver:
         self._rows = np.full((len(objects), POSE_SIZE), np.nan)
         self._row_of = {name: row for row, name in enumerate(objects)}
         self._status_inbox = Inbox(
-            lcm, STATUS_CHANNEL, lcmt_ur_status, _check_status, self._TakeStatus
+            lcm, STATUS_CHANNEL, lcmt_ur_status, self._TakeStatus, _check_status
         )
         self._poses_inbox = Inbox(
-            lcm, POSES_CHANNEL, lcmt_object_poses, _check_poses, self._TakePoses
+            lcm, POSES_CHANNEL, lcmt_object_poses, self._TakePoses, _check_poses
         )
 
     def _TakeStatus(self, message: lcmt_ur_status) -> None:
