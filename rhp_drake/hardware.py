@@ -59,7 +59,7 @@ def running_hardware(config: HardwareConfig, num_objects: int) -> Iterator[Hardw
     kinematics = Ur5Kinematics(config.kinematics)
     if config.lcm is not None:
         _check_number("lcm.objects", "objects", config.lcm.objects, num_objects)
-        driver = LcmDriver(config.lcm)
+        driver = LcmDriver(config.lcm, COMMAND_PERIOD)
         with ExitStack() as stack:
             stack.callback(driver.stop)
             driver.start()

@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 import math
+import multiprocessing
 from pathlib import Path
 import signal
 import struct
@@ -18,6 +19,7 @@ from rhp_drake.drivers.lcm_config import (
     COMMAND_CHANNEL,
     POSES_CHANNEL,
     STATUS_CHANNEL,
+    LcmConfig,
 )
 from rhp_drake.drivers.lcm_driver import LcmArm, LcmDriver, LcmTracker
 from rhp_drake.drivers.lcm_inbox import SenderClock
@@ -34,6 +36,7 @@ from rhp_drake.errors import InputError, WorkError
 from rhp_drake.hardware import load_hardware, running_hardware
 from rhp_drake.lcm_bridge import LcmBridge
 from rhp_drake.safety import Fault
+from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.station_models import StationConfig
 
 OBJECTS = ["target", "obstacle_1", "obstacle_2"]
@@ -63,7 +66,7 @@ class Planner:
     def __init__(self, lcm):
         status, poses = SharedVector(STATUS_SIZE), SharedVector(3 * POSE_SIZE)
         self.receiver = Receiver(lcm, OBJECTS, status, poses)
-        self.arm, self.tracker = LcmArm(lcm, status), LcmTracker(poses)
+        self.arm, self.tracker = LcmArm(lcm, status, COMMAND_PERIOD), LcmTracker(poses)
 
 
 class Robot:
@@ -317,7 +320,25 @@ def test_who_commanded_lets_go_and_nobody_else(lcm, clock, planner, bridge, robo
     clock.now += 0.008
     planner.arm.let_go()
     lcm.HandleSubscriptions(0)
-    assert [engaged for _, engaged in robot.commands] == [True, False]
+    # Said more than once, since it may be lost.
+    assert [engaged for _, engaged in robot.commands] == [True, False, False, False]
+
+
+def test_its_process_ends_even_if_letting_go_fails(monkeypatch):
+    def fail(lcm, channel, buffer):
+        raise RuntimeError("no network")
+
+    monkeypatch.setattr(DrakeLcm, "Publish", lambda lcm, channel, buffer: None)
+    driver = LcmDriver(LcmConfig(url=URL, objects=OBJECTS), COMMAND_PERIOD)
+    driver.arm.command(np.zeros(6), engaged=True)
+    monkeypatch.setattr(driver, "_WaitForAll", lambda: None)
+    others = multiprocessing.active_children()
+    driver.start()
+    assert len(multiprocessing.active_children()) == len(others) + 1
+    monkeypatch.setattr(DrakeLcm, "Publish", fail)
+    with pytest.raises(RuntimeError, match="no network"):
+        driver.stop()
+    assert multiprocessing.active_children() == others
 
 
 def test_the_bundled_file_knows_the_objects_of_the_bundled_scenarios():
@@ -398,7 +419,7 @@ def test_a_lab_a_driver_and_a_run(bridge_process, lab_file, tmp_path):
 @pytest.mark.slow
 def test_a_planner_that_falls_silent(bridge_process, lab_file):
     config = load_hardware(lab_file).lcm
-    driver = LcmDriver(config)
+    driver = LcmDriver(config, COMMAND_PERIOD)
     driver.start()
     try:
         position = driver.arm.read().position
@@ -408,6 +429,6 @@ def test_a_planner_that_falls_silent(bridge_process, lab_file):
         assert driver.arm.read().fault == Fault.NONE
         read_until(bridge_process, "no command came in time")
         with pytest.raises(WorkError, match="started anew: no command came in time"):
-            LcmDriver(config).start()
+            LcmDriver(config, COMMAND_PERIOD).start()
     finally:
         driver.stop()

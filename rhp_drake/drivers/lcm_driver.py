@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 # How long `start` waits for its process, and the first status and poses.
 _START_TIME: Final = 10.0  # s
+# How often it says that the arm is to follow no more: a datagram may be lost, or find
+# another in the other side's queue.
+_LET_GO_TIMES: Final = 3
 _FAULTS: Final = frozenset(Fault)
 
 
@@ -39,11 +42,15 @@ class LcmArm:
     Args:
         lcm: Where to send.
         status: What a `Receiver` writes.
+        command_period: Time from command to command, s.
     """
 
-    def __init__(self, lcm: "DrakeLcmInterface", status: SharedVector) -> None:
+    def __init__(
+        self, lcm: "DrakeLcmInterface", status: SharedVector, command_period: float
+    ) -> None:
         self._lcm = lcm
         self._status = status
+        self._command_period = command_period
         self._engaged = False
 
     def command(self, position: np.ndarray, engaged: bool) -> None:
@@ -61,9 +68,12 @@ class LcmArm:
         self._engaged = engaged
 
     def let_go(self) -> None:
-        """Says that the arm is to follow no more, if it does."""
-        if self._engaged:
+        """Says that the arm is to follow no more, if it does; takes a few periods."""
+        if not self._engaged:
+            return
+        for _ in range(_LET_GO_TIMES):
             self.command(np.full(NUM_JOINTS, np.nan), engaged=False)
+            time.sleep(self._command_period)
 
     def read(self) -> ArmMeasurement:
         """The newest measurement; its numbers are nan before the first.
@@ -109,12 +119,13 @@ class LcmDriver:
 
     Args:
         config: Where, and the names of the objects.
+        command_period: Time from command to command, s.
 
     Raises:
         InputError: If `config` is impossible.
     """
 
-    def __init__(self, config: LcmConfig) -> None:
+    def __init__(self, config: LcmConfig, command_period: float) -> None:
         from pydrake.lcm import DrakeLcm, DrakeLcmParams
 
         config.validate()
@@ -123,7 +134,7 @@ class LcmDriver:
         self._poses = SharedVector(len(config.objects) * POSE_SIZE)
         # Deferred: what only sends needs no thread that receives.
         params = DrakeLcmParams(lcm_url=config.url, defer_initialization=True)
-        self.arm = LcmArm(DrakeLcm(params), self._status)
+        self.arm = LcmArm(DrakeLcm(params), self._status, command_period)
         self.tracker = LcmTracker(self._poses)
         self._process = ReceiverProcess("LCM", receive)
 
@@ -139,9 +150,10 @@ class LcmDriver:
 
     def stop(self) -> None:
         """Lets the arm go, and ends the process, if it runs."""
-        if self._process.is_running:
+        try:
             self.arm.let_go()
-        self._process.stop()
+        finally:
+            self._process.stop()
 
     def _WaitForAll(self) -> None:
         give_up_at = time.monotonic() + _START_TIME
