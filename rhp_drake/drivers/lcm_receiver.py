@@ -12,6 +12,7 @@ import numpy as np
 from rhp_drake.drivers.lcm_config import POSES_CHANNEL, STATUS_CHANNEL, LcmConfig
 from rhp_drake.drivers.lcm_inbox import Inbox
 from rhp_drake.drivers.pose_rows import NORM_TOLERANCE, POSE_SIZE
+from rhp_drake.drivers.realtime import ask_for_realtime
 from rhp_drake.drivers.rhp_lcm import lcmt_object_poses, lcmt_ur_status
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.safety import NUM_JOINTS
@@ -29,6 +30,7 @@ def receive(config: LcmConfig, status: SharedVector, poses: SharedVector) -> Non
     from pydrake.lcm import DrakeLcm
 
     follow_parent()
+    ask_for_realtime()
     lcm = DrakeLcm(config.url)
     Receiver(lcm, config.objects, status, poses)
     while True:
