@@ -49,6 +49,7 @@ class LcmBridge:
         self._tracker = tracker
         self._objects = objects
         self._max_age = max_age
+        self._engaged = False
         self._due = time.monotonic()
         self._inbox = Inbox(lcm, COMMAND_CHANNEL, lcmt_ur_command, self._Take)
 
@@ -72,7 +73,8 @@ class LcmBridge:
         if age > self._max_age:
             return
         self._arm.command(np.array(command.joint_position), bool(command.engaged))
-        if not command.engaged:
+        self._engaged = bool(command.engaged)
+        if not self._engaged:
             # Whoever is next may have another clock.
             self._inbox.clock = SenderClock()
 
@@ -83,6 +85,7 @@ class LcmBridge:
         message.measured_utime = _measured_utime(message.utime, measured.age)
         message.joint_position_measured = list(measured.position)
         message.joint_velocity_estimated = list(measured.velocity)
+        message.engaged = self._engaged
         message.fault = int(measured.fault)
         self._lcm.Publish(STATUS_CHANNEL, message.encode())
         return measured.fault

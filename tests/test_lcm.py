@@ -1,6 +1,7 @@
 """The driver over LCM: messages both ways, their ages, what is dropped, a whole run."""
 
 from contextlib import ExitStack
+from dataclasses import replace
 import math
 import multiprocessing
 from pathlib import Path
@@ -322,6 +323,45 @@ def test_who_commanded_lets_go_and_nobody_else(lcm, clock, planner, bridge, robo
     lcm.HandleSubscriptions(0)
     # Said more than once, since it may be lost.
     assert [engaged for _, engaged in robot.commands] == [True, False, False, False]
+
+
+def test_a_second_planner_is_refused(lcm, clock, planner, bridge, robot):
+    driver = LcmDriver(LcmConfig(url=URL, objects=OBJECTS), COMMAND_PERIOD)
+    Receiver(lcm, OBJECTS, driver._status, driver._poses)  # As its process would.
+
+    def step():
+        clock.now += COMMAND_PERIOD
+        bridge.step()
+        lcm.HandleSubscriptions(0)
+
+    def start():
+        driver.start()
+        driver.stop()
+
+    step()
+    start()
+    planner.arm.command(np.zeros(6), engaged=True)
+    step()
+    with pytest.raises(WorkError, match=r"another program commands the arm\."):
+        start()
+    planner.arm.let_go()
+    step()
+    start()
+    # It is killed.
+    planner.arm.command(np.zeros(6), engaged=True)
+    robot.measured = replace(robot.measured, fault=Fault.STALE_COMMAND)
+    step()
+    with pytest.raises(WorkError, match="started anew: no command came in time"):
+        start()
+
+
+def test_who_lets_go_too_late_is_still_said_to_command(lcm, clock, planner, bridge):
+    send(lcm, COMMAND_CHANNEL, command(1_000_000))
+    clock.now += 0.2
+    send(lcm, COMMAND_CHANNEL, command(1_100_000, engaged=False))
+    bridge.step()
+    lcm.HandleSubscriptions(0)
+    assert planner.arm.is_commanded()
 
 
 def test_its_process_ends_even_if_letting_go_fails(monkeypatch):

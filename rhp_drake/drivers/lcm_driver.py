@@ -84,7 +84,7 @@ class LcmArm:
         if math.isnan(stamp):
             nan = np.full(NUM_JOINTS, np.nan)
             return ArmMeasurement(nan, nan, Fault.NONE, math.inf)
-        position, velocity, (fault, measured) = np.split(
+        position, velocity, (_, fault, measured) = np.split(
             values, [NUM_JOINTS, 2 * NUM_JOINTS]
         )
         return ArmMeasurement(
@@ -93,6 +93,11 @@ class LcmArm:
             Fault(fault) if fault in _FAULTS else Fault.NOT_RUNNING,
             time.monotonic() - measured,
         )
+
+    def is_commanded(self) -> bool:
+        """Whether the driver says that somebody, we or another, commands the arm."""
+        values, _ = self._status.read()
+        return values[2 * NUM_JOINTS] == 1
 
 
 class LcmTracker:
@@ -142,8 +147,8 @@ class LcmDriver:
         """Starts to receive, and waits until robot and objects have been heard of.
 
         Raises:
-            WorkError: If the driver says nothing, has not seen an object, or has a
-                fault.
+            WorkError: If the driver says nothing, has not seen an object, has a
+                fault, or is commanded by another program.
             RuntimeError: If it was started before.
         """
         self._process.start((self._config, self._status, self._poses), self._WaitForAll)
@@ -170,6 +175,10 @@ class LcmDriver:
                 f"the driver has stopped the arm and has to be started anew: "
                 f"{describe(fault)}"
             )
+        # One that was killed engages no longer than the driver's patience; then there
+        # is a fault.
+        if self.arm.is_commanded():
+            raise WorkError("another program commands the arm.")
 
     def _find_missing(self) -> str:
         """What has not been heard of, in words; empty if all has."""

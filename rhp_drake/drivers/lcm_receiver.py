@@ -21,8 +21,9 @@ from rhp_drake.workers import follow_parent
 if TYPE_CHECKING:
     from pydrake.lcm import DrakeLcmInterface
 
-# Layout of the shared vector: q, qd, fault, when they were measured (time.monotonic).
-STATUS_SIZE: Final = 2 * NUM_JOINTS + 2
+# Layout of the shared vector: q, qd, whether engaged, fault, when they were measured
+# (time.monotonic).
+STATUS_SIZE: Final = 2 * NUM_JOINTS + 3
 
 
 def receive(config: LcmConfig, status: SharedVector, poses: SharedVector) -> None:
@@ -70,6 +71,7 @@ class Receiver:
                 [
                     *message.joint_position_measured,
                     *message.joint_velocity_estimated,
+                    message.engaged,
                     message.fault,
                     self._status_inbox.clock.to_ours(message.measured_utime),
                 ]

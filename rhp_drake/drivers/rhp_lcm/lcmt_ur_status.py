@@ -9,11 +9,11 @@ import struct
 
 class lcmt_ur_status(object):
 
-    __slots__ = ["utime", "measured_utime", "joint_position_measured", "joint_velocity_estimated", "fault"]
+    __slots__ = ["utime", "measured_utime", "joint_position_measured", "joint_velocity_estimated", "engaged", "fault"]
 
-    __typenames__ = ["int64_t", "int64_t", "double", "double", "int32_t"]
+    __typenames__ = ["int64_t", "int64_t", "double", "double", "boolean", "int32_t"]
 
-    __dimensions__ = [None, None, [6], [6], None]
+    __dimensions__ = [None, None, [6], [6], None, None]
 
     def __init__(self):
         self.utime = 0
@@ -40,6 +40,13 @@ class lcmt_ur_status(object):
         LCM Type: double[6]
         """
 
+        self.engaged = False
+        """
+        Whether somebody commands the arm: `engaged` of the last command that came; false
+        before the first.  Who finds it true at the start has to keep away.
+        LCM Type: boolean
+        """
+
         self.fault = 0
         """
         Why the arm was stopped: a value of `Fault` in rhp_drake/safety.py.  It stays until
@@ -58,7 +65,7 @@ class lcmt_ur_status(object):
         buf.write(struct.pack(">qq", self.utime, self.measured_utime))
         buf.write(struct.pack('>6d', *self.joint_position_measured[:6]))
         buf.write(struct.pack('>6d', *self.joint_velocity_estimated[:6]))
-        buf.write(struct.pack(">i", self.fault))
+        buf.write(struct.pack(">bi", self.engaged, self.fault))
 
     @staticmethod
     def decode(data: bytes):
@@ -76,13 +83,14 @@ class lcmt_ur_status(object):
         self.utime, self.measured_utime = struct.unpack(">qq", buf.read(16))
         self.joint_position_measured = struct.unpack('>6d', buf.read(48))
         self.joint_velocity_estimated = struct.unpack('>6d', buf.read(48))
+        self.engaged = bool(struct.unpack('b', buf.read(1))[0])
         self.fault = struct.unpack(">i", buf.read(4))[0]
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if lcmt_ur_status in parents: return 0
-        tmphash = (0xf0c7759b955c0598) & 0xffffffffffffffff
+        tmphash = (0xc0cf07c4496d9db8) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None
