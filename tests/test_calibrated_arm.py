@@ -11,6 +11,7 @@ import pytest
 
 from rhp_drake import hardware
 from rhp_drake.closed_loop import AddRobot, Hardware
+from rhp_drake.commands.driver import driver
 from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.errors import InputError
 from rhp_drake.safety import Fault
@@ -155,3 +156,21 @@ def test_figures_of_another_arm_are_refused(tmp_path):
     )
     with pytest.raises(InputError, match="lab: kinematics: the deltas move the hand"):
         hardware.load_hardware(path)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_a_driver_over_lcm_says_that_the_planner_needs_the_figures(
+    calibrated, tmp_path, monkeypatch, capsys
+):
+    path = tmp_path / "lab.yaml"
+    figures = "kinematics: {delta_a: [0, 1.0e-4, 0, 0, 0, 0]}" if calibrated else ""
+    path.write_text(f"lab: {{ur: {{host: robot}}, {figures}}}")
+
+    def refuse(config, num_objects):
+        raise InputError("no robot.")
+
+    monkeypatch.setattr(hardware, "running_hardware", refuse)
+    with pytest.raises(InputError, match="no robot"):
+        driver(path)
+    told = "this file's `kinematics` in its own file" in capsys.readouterr().out
+    assert told == calibrated

@@ -30,11 +30,17 @@ def driver(
     from rhp_drake.hardware import load_hardware, running_hardware
     from rhp_drake.lcm_bridge import LcmBridge
     from rhp_drake.safety import Fault, describe
+    from rhp_drake.station.ur5_kinematics import DhDeltas
 
     config = load_hardware(file)
     lcm = config.lcm or LcmConfig()
     objects = config.natnet.bodies
     console = task_run.make_console()
+    if config.kinematics != DhDeltas():
+        # The messages have joints, not the hand.
+        console.print(
+            "Whoever plans needs this file's `kinematics` in its own file, too."
+        )
     console.print(f"Connecting to {config.description or file}")
     fault = Fault.NONE
     try:

@@ -39,7 +39,8 @@ class HardwareConfig:
         kinematics: Its DH parameters, if they are not the nominal ones.
         natnet: The tracker.
         lcm: Where a driver of both is reached, if it runs on its own, as `rhp driver`
-            does; `ur` and `natnet` are then its business.
+            does; `ur` and `natnet` are then its business.  `kinematics` is not: over
+            LCM go joint positions, and whoever plans has to know the arm.
     """
 
     description: str = ""
