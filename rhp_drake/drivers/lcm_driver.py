@@ -149,7 +149,7 @@ class LcmDriver:
         Raises:
             WorkError: If the driver says nothing, has not seen an object, has a
                 fault, or is commanded by another program.
-            RuntimeError: If it was started before.
+            RuntimeError: If the driver is running.
         """
         self._process.start((self._config, self._status, self._poses), self._WaitForAll)
 

@@ -13,10 +13,7 @@ from typing import Final
 
 from rhp_drake.drivers.measurements import ObjectPose
 from rhp_drake.drivers.natnet_config import NatNetConfig, PoseConfig, listed
-from rhp_drake.drivers.natnet_receiver import (
-    START_TIME,
-    receive,
-)
+from rhp_drake.drivers.natnet_receiver import START_TIME, receive
 from rhp_drake.drivers.pose_rows import POSE_SIZE, to_poses
 from rhp_drake.drivers.receiver_process import ReceiverProcess
 from rhp_drake.drivers.shared_memory import SharedVector
