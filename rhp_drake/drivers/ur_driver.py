@@ -20,12 +20,11 @@ from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.drivers.ur_stream import (
     COMMAND_SIZE,
     MEASUREMENT_SIZE,
-    NUM_JOINTS,
     STOP_TIME,
     serve,
 )
 from rhp_drake.errors import InputError
-from rhp_drake.safety import Fault, describe
+from rhp_drake.safety import NUM_JOINTS, Fault, describe
 
 
 class UrDriver:
