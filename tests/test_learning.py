@@ -125,18 +125,6 @@ def test_hindsight_counts_actions(data):
         assert len(way) == count
 
 
-def test_simulated_ways_to_the_goal_bound_the_values(data):
-    assert not np.isfinite(sample([data], 4000, stream(1)).least_returns).any()
-    bounded = sample([data], 4000, stream(1), search_returns=True)
-    known = np.isfinite(bounded.least_returns)
-    assert 0.01 < known.mean() < 1
-    one = bounded.least_returns == -1
-    assert goals_reached(bounded.next_states[one], bounded.goals[one]).all()
-    assert not goals_reached(
-        bounded.next_states[known & ~one], bounded.goals[known & ~one]
-    ).any()
-
-
 def test_the_loss_of_imitation_may_stay(data):
     """It is the sum of both, on the same batches."""
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _VARIANTS = (
     "best,from_scratch,executed_only,no_hindsight,paper_network,no_symmetry,"
-    "plans_only,no_double_q,epsilon_greedy,uncertain_physics,search_returns,paper"
+    "plans_only,no_double_q,epsilon_greedy,uncertain_physics,paper"
 )
 
 

@@ -11,7 +11,6 @@ import pyarrow as pa
 from rhp_drake.errors import InputError
 from rhp_drake.learning.demonstration_files import lengths, numbers, read_table
 from rhp_drake.learning.demonstration_folder import shard_paths
-from rhp_drake.task import goals_reached
 
 
 @dataclass(frozen=True)
@@ -29,9 +28,6 @@ class Dataset:
         search_actions: Shape (T,).
         search_next_states: Shape (T, 3 + 3 m).
         search_origins: For each transition, which one led to its state; -1 at a root.
-        search_actions_left: From each transition's state to the task's goals on the
-            shortest way that starts with it and that was simulated, at least 1; 0 if
-            there is none.  Shape (T,).
         solved: Whether each task has a plan, shape (P,).
     """
 
@@ -45,7 +41,6 @@ class Dataset:
     search_actions: np.ndarray
     search_next_states: np.ndarray
     search_origins: np.ndarray
-    search_actions_left: np.ndarray
     solved: np.ndarray
 
 
@@ -98,10 +93,8 @@ def _flatten(path: Path, table: pa.Table) -> Dataset:
     search_states = next_states[origins]
     search_states[at_root] = initial_states[search_tasks[at_root]]
     plan_ends = np.cumsum(plan_lengths)
-    goals = goals.reshape(len(goals), -1, 2)
-    reached = goals_reached(next_states, goals[search_tasks])
     return Dataset(
-        goals=goals,
+        goals=goals.reshape(len(goals), -1, 2),
         plan_tasks=np.repeat(np.arange(table.num_rows, dtype=np.int32), plan_lengths),
         plan_states=states[before_end],
         plan_actions=numbers(table["actions"]),
@@ -113,20 +106,8 @@ def _flatten(path: Path, table: pa.Table) -> Dataset:
         search_actions=numbers(table["search_actions"]),
         search_next_states=next_states,
         search_origins=origins,
-        search_actions_left=_actions_left(reached, origins),
         solved=table["solved"].to_numpy(),
     )
-
-
-def _actions_left(reached: np.ndarray, origins: np.ndarray) -> np.ndarray:
-    """`Dataset.search_actions_left`, from where the goals are and what led there."""
-    left = reached.astype(np.int16)
-    # Nothing comes before its origin, so backwards all ways from a state are known.
-    for index in range(len(left) - 1, -1, -1):
-        origin = origins[index]
-        if left[index] and origin >= 0 and not 0 < left[origin] <= left[index] + 1:
-            left[origin] = left[index] + 1
-    return left
 
 
 def without_oldest(data: Dataset, num_transitions: int) -> Dataset:
@@ -140,7 +121,6 @@ def without_oldest(data: Dataset, num_transitions: int) -> Dataset:
         search_actions=data.search_actions[kept],
         search_next_states=data.search_next_states[kept],
         search_origins=np.maximum(origins, -1),
-        search_actions_left=data.search_actions_left[kept],
     )
 
 

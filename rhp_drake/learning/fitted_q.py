@@ -37,7 +37,6 @@ class FittedQConfig:
         l2: See `LearnerConfig`, as the next three.
         target_rate: How far the target network follows at each step.
         hindsight: How many of a batch's samples get goals in hindsight.
-        search_returns: Whether a way to the goal that was simulated bounds the value.
         double_q: Whether the target's action is the network's choice, not the target
             network's own.
         symmetry: Whether samples are seen through random symmetries.
@@ -54,7 +53,6 @@ class FittedQConfig:
     num_steps: int = 40_000
     target_rate: float = 0.005
     hindsight: float = 0.5
-    search_returns: bool = False
     double_q: bool = True
     symmetry: bool = True
     squared_errors: bool = False
@@ -143,7 +141,6 @@ class FittedQ(Learner):
             config.batch_size,
             self._generator,
             hindsight=config.hindsight,
-            search_returns=config.search_returns,
         )
         network = self.network
         symmetry = (

@@ -48,7 +48,6 @@ def sample(
     generator: np.random.Generator,
     *,
     hindsight: float = 0.0,
-    search_returns: bool = False,
 ) -> Samples:
     """Draws N transitions and their goals, as many from each source.
 
@@ -57,12 +56,10 @@ def sample(
         num_samples: N.
         generator: Draws them.
         hindsight: How many of the samples get goals in hindsight, 0 to 1.
-        search_returns: Whether a way to the task's goal that was simulated counts as a
-            return known to be reached.
     """
     shares = np.diff(np.arange(len(sources) + 1) * num_samples // len(sources))
     parts = [
-        _sample(source, int(share), generator, hindsight, search_returns)
+        _sample(source, int(share), generator, hindsight)
         for source, share in zip(sources, shares, strict=True)
     ]
     return Samples(
@@ -78,7 +75,6 @@ def _sample(
     num_samples: int,
     generator: np.random.Generator,
     hindsight: float,
-    search_returns: bool,
 ) -> Samples:
     rows = generator.integers(len(data.search_actions), size=num_samples)
     # The first of them in hindsight.
@@ -87,9 +83,6 @@ def _sample(
     rows[changed], num_actions = _go_back(data, ends, generator)
     goals = data.goals[data.search_tasks[rows]]
     least = np.full(num_samples, -np.inf)
-    if search_returns:
-        left = data.search_actions_left[rows]
-        least[left > 0] = REWARD * left[left > 0]
     found, useful = _goals_in_hindsight(
         data.search_states[rows[changed]],
         data.search_next_states[ends],

@@ -61,6 +61,5 @@ VARIANTS: Final = {
     "no_double_q": replace(BEST, learning=replace(_LEARNING, double_q=False)),
     "epsilon_greedy": replace(BEST, rounds=_acting(horizon=0)),
     "uncertain_physics": replace(BEST, rounds=_acting(uncertainty="high")),
-    "search_returns": replace(BEST, learning=replace(_LEARNING, search_returns=True)),
     "paper": PAPER,
 }
