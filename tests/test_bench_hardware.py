@@ -57,6 +57,7 @@ def injection(kind, **changes):
         "num_commands": 9,
         "bad_command": "",
         "problem": "",
+        "false_alarms": [],
     }
     return Injection(**values | changes)
 

@@ -133,6 +133,8 @@ class RunProcess:
         Raises:
             WorkError: If they do not start.
         """
+        if not self._process.is_alive():
+            self.restart()
         self._bad_command.value = BadCommand.NONE
         self._connection.send((goal, seed))
         answer = self._receive(_PATIENCE)

@@ -133,6 +133,8 @@ def faults(
     You may stop this at any moment: the same command goes on where it was. The exit
     status is 1 if anything was not as it has to be.
     """
+    from collections import Counter
+
     from rich.console import Console
 
     from rhp_drake.benchmarks.fault_campaign import run_campaign
@@ -158,8 +160,11 @@ def faults(
     console.print(
         f"{len(injections)} injections, {commands} positions sent, "
         f"{sum(bool(x.bad_command) for x in injections)} runs with one out of limits, "
-        f"{len(wrong)} with something wrong.  {describe_machine()}"
+        f"{len(wrong)} with something wrong."
     )
+    alarms = Counter(name for x in injections for name in x.false_alarms)
+    console.print(f"Runs that ended before for nothing: {dict(alarms) or 'none'}.")
+    console.print(describe_machine())
     raise typer.Exit(1 if wrong else 0)
 
 
