@@ -148,13 +148,13 @@ FAULT_KINDS: Final = {
         _signalled(signal.SIGKILL, "ur"), Fault.CONNECTION_LOST
     ),
     "ours: kill -9, tracker's driver": _stops(
-        _signalled(signal.SIGKILL, "natnet"), Fault.STALE_POSE
+        _signalled(signal.SIGKILL, "NatNet"), Fault.STALE_POSE
     ),
     "ours: robot's driver stalled": _stops(
         _signalled(signal.SIGSTOP, "ur"), Fault.STALE_MEASUREMENT
     ),
     "ours: tracker's driver stalled": _stops(
-        _signalled(signal.SIGSTOP, "natnet"), Fault.STALE_POSE
+        _signalled(signal.SIGSTOP, "NatNet"), Fault.STALE_POSE
     ),
     "ours: kill -9, the loop": _stops(_signalled(signal.SIGKILL, None)),
 }

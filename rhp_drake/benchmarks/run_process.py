@@ -160,7 +160,7 @@ class RunProcess:
         self.send_signal(signal.SIGINT)
 
     def send_signal(self, number: int, driver: str | None = None) -> None:
-        """Sends a signal to the process, or to one of its drivers: "ur", "natnet"."""
+        """Sends a signal to the process, or to one of its drivers: "ur", "NatNet"."""
         pid = self._process.pid if driver is None else self._driver_pids[driver]
         assert pid is not None
         os.kill(pid, number)
