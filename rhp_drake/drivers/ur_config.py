@@ -28,7 +28,7 @@ class UrDriverConfig:
     lookahead_time: float = 0.1
     gain: float = 300.0
     limits: JointLimits = field(default_factory=JointLimits)
-    command_timeout: float = 0.05
+    command_timeout: float = 0.08
     measurement_timeout: float = 0.04
     patience: float = 5.0
     connection_timeout: float = 10.0
