@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rhp_drake.errors import InputError
-from rhp_drake.learning.dataset import _actions_left, load_dataset, without_oldest
+from rhp_drake.learning.dataset import load_dataset, without_oldest
 from rhp_drake.learning.demonstration import Demonstration, training_task
 from rhp_drake.learning.demonstration_files import about, lengths, read_table
 from rhp_drake.learning.demonstration_folder import (
@@ -367,13 +367,6 @@ def test_verification_notices_a_wrong_plan(folder, tmp_path):
     _turn_about(folder, path)
     (replay,) = verify([path], 1)
     assert replay.reached == replay.identical == replay.num_plans - 1
-
-
-def test_actions_left_are_those_of_the_shortest_way():
-    # 0 -> 1 -> 2 (goal), 0 -> 3 (goal), and 4 leads nowhere.
-    origins = np.array([-1, 0, 1, 0, -1])
-    reached = np.array([False, False, True, True, False])
-    np.testing.assert_array_equal(_actions_left(reached, origins), [2, 2, 1, 1, 0])
 
 
 def test_the_oldest_transitions_go_first(folder):
