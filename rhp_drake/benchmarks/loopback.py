@@ -32,7 +32,8 @@ from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 _SCENARIO: Final = Path("three_boxes")
 _POLICY: Final = "policy: !RecedingHorizonConfig {}"
 _NUM_OBJECTS: Final = 3
-_HOST: Final = "127.0.0.3"
+# Loopback address of the lab; others' is another.
+_HOST: Final = "127.0.0.4"
 _PATIENCE: Final = 300.0  # s, the longest run.
 
 
