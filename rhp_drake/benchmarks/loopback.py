@@ -33,7 +33,7 @@ _SCENARIO: Final = Path("three_boxes")
 _POLICY: Final = "policy: !RecedingHorizonConfig {}"
 _NUM_OBJECTS: Final = 3
 # Loopback address of the lab; others' is another.
-_HOST: Final = "127.0.0.4"
+_HOST: Final = "127.0.0.5"
 _PATIENCE: Final = 300.0  # s, the longest run.
 
 
