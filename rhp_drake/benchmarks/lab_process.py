@@ -42,7 +42,7 @@ class LabLog:
         times: Of each period of the controller, s of time.monotonic, shape (N,).
         positions: Of the joints then, as measured, rad, shape (N, 6).
         speeds: The fastest joint's, rad/s, shape (N,).
-        command_times: When a position of servoJ was taken, s since the lab began,
+        command_times: When a position of servoJ was taken, s of time.monotonic,
             shape (K,).
         commands: These positions, rad, shape (K, 6).
         stop_reason: Why the robot says that it stopped.
@@ -153,11 +153,14 @@ class _Session:
     def end(self) -> LabLog:
         self.lab.close()
         taken = [c for c in self.lab.controller.commands if c.name == "servoJ"]
+        times = np.array(self._times)
+        # The lab's own clock stands still while the lab is not run.
+        ticks = np.rint([c.time / COMMAND_PERIOD for c in taken]).astype(int)
         return LabLog(
-            np.array(self._times),
+            times,
             np.reshape(self._positions, (-1, NUM_JOINTS)),
             np.array(self._speeds),
-            np.array([command.time for command in taken]),
+            times[ticks],
             np.reshape([c.arguments[:NUM_JOINTS] for c in taken], (-1, NUM_JOINTS)),
             self.lab.controller.stop_reason,
         )
