@@ -1,6 +1,6 @@
 """The benches of the hardware side: what they conclude from what they saw."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 import json
 import math
 
@@ -27,7 +27,7 @@ from rhp_drake.station.hardware_station import HardwareConfig
 from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.ur5_kinematics import inverse_kinematics
 
-HOST = "127.0.0.27"  # Of this module alone.
+HOST = "127.0.0.28"  # Of this module alone.
 START = inverse_kinematics(np.array([0.5, 0.0, 0.2]))
 
 
@@ -57,6 +57,7 @@ def injection(kind, **changes):
         "num_commands": 9,
         "bad_command": "",
         "problem": "",
+        "lab_gap_ms": 9.0,
         "false_alarms": [],
     }
     return Injection(**values | changes)
@@ -176,6 +177,21 @@ def test_summary():
     assert row.hold_ms == (120.0, 140.0)
     assert late.stopped == 0
     assert np.isnan(late.hold_ms).all()
+
+
+def test_the_lab_tells_when_it_stood_still():
+    still = replace(log(positions=[START] * 5), times=np.array([0, 1, 2, 7, 9]) / 100)
+    assert still.longest_gap() == pytest.approx(0.05)
+    assert still.longest_gap(since=0.08) == pytest.approx(0.02)
+    assert log().longest_gap() == 0.0
+
+
+def test_injections_come_back_from_their_file(tmp_path):
+    path = tmp_path / "injections.json"
+    alarms = [("STALE_POSE", 12.5)]
+    written = injection(_kind(0, seed=0), hold_ms=80.0, false_alarms=alarms)
+    path.write_text(json.dumps([asdict(written)]))
+    assert list(run_campaign(path, 1, seed=0)) == [written]
 
 
 def test_a_file_of_another_seed_is_refused(tmp_path):

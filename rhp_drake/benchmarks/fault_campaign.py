@@ -32,6 +32,8 @@ from rhp_drake.task import sample_instance
 
 # Within so long the arm has to hold.
 HOLD_TIME: Final = 0.150  # s
+# ms: twice a period and more is no robot's.
+LAB_STALL: Final = 20.0
 _SCENARIO: Final = Path("three_boxes")
 _POLICY: Final = "policy: !GreedyConfig {}"
 _NUM_OBJECTS: Final = 3
@@ -64,7 +66,10 @@ class Injection:
         num_commands: How many positions the controller was told.
         bad_command: What was wrong with one of them; "" if all were in order.
         problem: What else was not as it has to be; "" if all was.
-        false_alarms: The faults that ended runs before anything had gone wrong.
+        lab_gap_ms: How long the lab itself stood still from then on, at most, ms: its
+            computer is to blame, for a robot has one of its own.
+        false_alarms: The faults that ended runs before anything had gone wrong, and
+            how long the lab had stood still in those runs, at most, ms.
     """
 
     index: int
@@ -75,7 +80,8 @@ class Injection:
     num_commands: int
     bad_command: str
     problem: str
-    false_alarms: list[str]
+    lab_gap_ms: float
+    false_alarms: list[tuple[str, float]]
 
 
 def read_injections(path: Path) -> list[Injection]:
@@ -85,9 +91,13 @@ def read_injections(path: Path) -> list[Injection]:
         InputError: If it cannot be read.
     """
     try:
-        return [Injection(**row) for row in json.loads(path.read_text())]
+        injections = [Injection(**row) for row in json.loads(path.read_text())]
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path}: cannot be read: {error}.") from None
+    return [
+        replace(x, false_alarms=[(name, gap) for name, gap in x.false_alarms])
+        for x in injections
+    ]
 
 
 def run_campaign(path: Path, count: int, seed: int) -> Iterator[Injection]:
@@ -147,14 +157,13 @@ def _inject(
     seed: int,
 ) -> Injection:
     """Runs tasks until one gets as far as that something can go wrong."""
-    false_alarms: list[str] = []
+    false_alarms: list[tuple[str, float]] = []
     for attempt in range(_ATTEMPTS):
         generator = stream(seed, "fault_campaign", index, attempt)
         done = _attempt(lab, run, hardware, index, name, generator)
         if isinstance(done, Injection):
             return replace(done, false_alarms=false_alarms)
-        if done != Fault.NONE:
-            false_alarms.append(done.name)
+        false_alarms += done
     raise WorkError(f"no run gets far enough for an injection: {false_alarms}.")
 
 
@@ -165,8 +174,8 @@ def _attempt(
     index: int,
     name: str,
     generator: np.random.Generator,
-) -> Injection | Fault:
-    """One task, and what goes wrong; or the fault that ended it before, or none."""
+) -> Injection | list[tuple[str, float]]:
+    """One task, and what goes wrong; or the false alarm that came before, if any."""
     kind = FAULT_KINDS[name]
     instance = sample_instance(generator, _NUM_OBJECTS)
     lab.begin(instance, nominal_physics(_NUM_OBJECTS), index)
@@ -176,10 +185,12 @@ def _attempt(
         time.sleep(_POLL_PERIOD)
     time.sleep(generator.uniform(0.0, _LATEST))
     if run.is_over:
-        lab.end()
+        gap_ms = 1000 * lab.end().longest_gap()
         report = _end_run(run, kind)
         ended = report.outcome if isinstance(report, RunReport) else None
-        return Fault.NONE if ended is None else ended.fault
+        if ended is None or ended.fault == Fault.NONE:
+            return []
+        return [(ended.fault.name, gap_ms)]
     at = kind.inject(lab, run, generator)
     time.sleep(max(0.0, at + _WATCHED - time.monotonic()))
     log = lab.end()
@@ -198,6 +209,7 @@ def _attempt(
         num_commands=len(log.commands),
         bad_command=_bad_command(log, hardware),
         problem=problem or report.crash or _verdict(kind, said, hold_ms),
+        lab_gap_ms=1000 * log.longest_gap(at),
         false_alarms=[],
     )
 

@@ -15,6 +15,8 @@ from rhp_drake.safety import Fault
 # Does it; returns when, s of time.monotonic.
 _Inject: TypeAlias = Callable[[LabProcess, RunProcess, np.random.Generator], float]
 
+# s: four times as long as the driver waits for a command to an arm that moves.
+_STALL: Final = 0.3
 _OBJECTS: Final = ("target", "obstacle_1", "obstacle_2")
 
 
@@ -69,10 +71,10 @@ def _signalled(number: int, driver: str | None) -> _Inject:
 
 
 def _stall(lab: LabProcess, run: RunProcess, generator: np.random.Generator) -> float:
-    """The loop is not run for half a second."""
+    """The loop is not run for a while; what it says then is waited for."""
     run.send_signal(signal.SIGSTOP)
     begin = time.monotonic()
-    time.sleep(0.5)
+    time.sleep(_STALL)
     run.send_signal(signal.SIGCONT)
     return begin
 
@@ -143,7 +145,7 @@ FAULT_KINDS: Final = {
         _spoiled(BadCommand.BEYOND_RANGE), Fault.POSITION_LIMIT
     ),
     # At rest it may be late, as a policy that thinks is.
-    "ours: loop stalled for 0.5 s": _may_go_on(_stall, Fault.STALE_COMMAND),
+    "ours: loop stalled for 0.3 s": _may_go_on(_stall, Fault.STALE_COMMAND),
     "ours: kill -9, robot's driver": _stops(
         _signalled(signal.SIGKILL, "ur"), Fault.CONNECTION_LOST
     ),

@@ -61,6 +61,15 @@ class LabLog:
         moving = np.flatnonzero(away)
         return float(self.times[moving[-1]]) if len(moving) else -math.inf
 
+    def longest_gap(self, since: float = -math.inf) -> float:
+        """For how long the lab itself stood still at most, s, which no robot does.
+
+        Args:
+            since: From when on to look, s of time.monotonic.
+        """
+        gaps = np.diff(self.times)[self.times[1:] >= since]
+        return float(gaps.max(initial=0.0))
+
     def moves_at(self, time_: float) -> bool:
         """Whether the arm moved at a time, s of time.monotonic."""
         index = min(int(np.searchsorted(self.times, time_)), len(self.times) - 1)

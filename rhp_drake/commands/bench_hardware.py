@@ -137,7 +137,7 @@ def faults(
 
     from rich.console import Console
 
-    from rhp_drake.benchmarks.fault_campaign import run_campaign
+    from rhp_drake.benchmarks.fault_campaign import LAB_STALL, run_campaign
     from rhp_drake.commands.progress import make_progress
     from rhp_drake.evaluation.machine import describe_machine
 
@@ -155,15 +155,23 @@ def faults(
     console.print(_fault_table(injections))
     wrong = [x for x in injections if x.bad_command or x.problem]
     for x in wrong:
-        console.print(f"{x.index}: {x.kind}: {x.bad_command} {x.problem} ({x.said})")
+        console.print(
+            f"{x.index}: {x.kind}: {x.bad_command} {x.problem} ({x.said}); "
+            f"the lab itself stood still for {x.lab_gap_ms:.0f} ms."
+        )
     commands = sum(x.num_commands for x in injections)
     console.print(
         f"{len(injections)} injections, {commands} positions sent, "
         f"{sum(bool(x.bad_command) for x in injections)} runs with one out of limits, "
         f"{len(wrong)} with something wrong."
     )
-    alarms = Counter(name for x in injections for name in x.false_alarms)
-    console.print(f"Runs that ended before for nothing: {dict(alarms) or 'none'}.")
+    alarms = [alarm for x in injections for alarm in x.false_alarms]
+    console.print(
+        "Runs that ended before for nothing: "
+        f"{dict(Counter(name for name, _ in alarms)) or 'none'}; in "
+        f"{sum(gap > LAB_STALL for _, gap in alarms)} of them the lab itself had stood "
+        f"still for more than {LAB_STALL:.0f} ms."
+    )
     console.print(describe_machine())
     raise typer.Exit(1 if wrong else 0)
 
