@@ -1,6 +1,6 @@
 """A real robot and its tracker: what a file says of them, and their drivers.
 
-A file maps names to labs, as a scenario file maps names to scenarios.  What it leaves
+A file maps a name to a lab, as a scenario file maps names to scenarios.  What it leaves
 out has the default that `station.hardware_station.HardwareConfig` gives it.
 """
 
@@ -20,24 +20,25 @@ from rhp_drake.station.ports import COMMAND_PERIOD
 from rhp_drake.station.ur5_kinematics import Ur5Kinematics
 
 
-def load_hardware(path: Path, name: str | None = None) -> HardwareConfig:
+def load_hardware(path: Path) -> HardwareConfig:
     """Reads what is known of a robot and its tracker.
 
     Args:
         path: The file, or the bare name of one that comes with the package.
-        name: Which of the file's labs; may be None if it has one.
 
     Raises:
         InputError: If anything is wrong with it; the message names file and key.
     """
-    where, _, node = read_named(path, name, "lab")
+    where, _, node = read_named(path, None, "lab")
     config = typed_yaml.merge(node, HardwareConfig(), where)
     try:
         Ur5Kinematics(config.kinematics)
         if config.lcm is not None:
             config.lcm.validate()
-        else:
+        # A file may be for both sides of LCM.
+        if config.lcm is None or config.ur.host:
             config.ur.validate()
+            config.natnet.validate()
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return config

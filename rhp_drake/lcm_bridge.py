@@ -2,7 +2,7 @@
 
 import math
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -19,6 +19,10 @@ from rhp_drake.station.ports import COMMAND_PERIOD
 
 if TYPE_CHECKING:
     from pydrake.lcm import DrakeLcmInterface
+
+
+# s: so long after a planner let the arm go another may come.
+_FORGET_TIME: Final = 1.0
 
 
 class LcmBridge:
@@ -50,6 +54,7 @@ class LcmBridge:
         self._objects = objects
         self._max_age = max_age
         self._engaged = False
+        self._heard_at = -math.inf
         self._due = time.monotonic()
         self._inbox = Inbox(lcm, COMMAND_CHANNEL, lcmt_ur_command, self._Take)
 
@@ -65,18 +70,20 @@ class LcmBridge:
             self._lcm.HandleSubscriptions(max(0, math.ceil(1000 * left)))
         # Late once, it is not early afterwards.
         self._due = max(self._due + COMMAND_PERIOD, time.monotonic())
+        if not self._engaged and time.monotonic() - self._heard_at > _FORGET_TIME:
+            # Whoever is next may have another clock; but not at once, for a command
+            # that was overtaken on the way must not look new.
+            self._inbox.clock = SenderClock()
         self._PublishPoses()
         return self._PublishStatus()
 
     def _Take(self, command: lcmt_ur_command) -> None:
-        age = time.monotonic() - self._inbox.clock.to_ours(command.utime)
+        self._heard_at = time.monotonic()
+        age = self._heard_at - self._inbox.clock.to_ours(command.utime)
         if age > self._max_age:
             return
         self._arm.command(np.array(command.joint_position), bool(command.engaged))
         self._engaged = bool(command.engaged)
-        if not self._engaged:
-            # Whoever is next may have another clock.
-            self._inbox.clock = SenderClock()
 
     def _PublishStatus(self) -> Fault:
         message = lcmt_ur_status()

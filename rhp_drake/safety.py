@@ -40,6 +40,7 @@ class Fault(enum.IntEnum):
     OBJECT_TILTED = 13
     OBJECT_JUMPED = 14
     IMPLAUSIBLE_MEASUREMENT = 15
+    LET_GO = 16
 
 
 _SENTENCES: Final = {
@@ -61,6 +62,7 @@ _SENTENCES: Final = {
     Fault.OBJECT_JUMPED: "an object is suddenly elsewhere: somebody moved it, or the "
     "tracker takes one for another.",
     Fault.IMPLAUSIBLE_MEASUREMENT: "the robot tells what cannot be.",
+    Fault.LET_GO: "who commanded the arm let it go while it moved.",
 }
 
 
@@ -87,11 +89,15 @@ class JointLimits:
     velocity_limit: float = 1.5
     tracking_limit: float = 0.2
 
-    def validate(self) -> None:
-        """Raises an InputError if a limit is impossible, or no limit at all."""
+    def validate(self, where: str) -> None:
+        """Raises an InputError if a limit is impossible, or no limit at all.
+
+        Args:
+            where: What comes before a limit's name in errors.
+        """
         if len(self.position_limits) != NUM_JOINTS:
             raise InputError(
-                f"position_limits: {self.position_limits}; there must be "
+                f"{where}position_limits: {self.position_limits}; there must be "
                 f"{NUM_JOINTS} positive ones."
             )
         for name, values, largest in (
@@ -102,8 +108,8 @@ class JointLimits:
             # Written so that nan is refused, too.
             if not all(0 < value <= largest for value in values):
                 raise InputError(
-                    f"{name}: {', '.join(map(str, values))}; it must be positive, and "
-                    f"at most {largest:.2f}."
+                    f"{where}{name}: {', '.join(map(str, values))}; it must be "
+                    f"positive, and at most {largest:.2f}."
                 )
 
 

@@ -151,7 +151,7 @@ def read_named(
         _check_named(path, document, kind)
         if len(document) > 1:
             raise InputError(
-                f"{path}: has several {kind}s, choose one by name: "
+                f"{path}: has several {kind}s where one has to be chosen: "
                 f"{', '.join(document)}."
             )
         (name,) = document

@@ -164,7 +164,8 @@ def test_a_driver_over_lcm_says_that_the_planner_needs_the_figures(
 ):
     path = tmp_path / "lab.yaml"
     figures = "kinematics: {delta_a: [0, 1.0e-4, 0, 0, 0, 0]}" if calibrated else ""
-    path.write_text(f"lab: {{ur: {{host: robot}}, {figures}}}")
+    known = "ur: {host: robot}, natnet: {bodies: [a]}"
+    path.write_text(f"lab: {{{known}, {figures}}}")
 
     def refuse(config, num_objects):
         raise InputError("no robot.")

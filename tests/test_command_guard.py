@@ -192,6 +192,8 @@ def test_config_loads_from_yaml():
         CommandGuardConfig(tracking_limit=1.0),
         CommandGuardConfig(position_limits=[1.0]),
         CommandGuardConfig(object_age_limit=-1.0),
+        CommandGuardConfig(object_age_limit=80.0),
+        CommandGuardConfig(workspace_margin=2.0),
         CommandGuardConfig(height_tolerance=math.nan),
     ],
 )

@@ -46,9 +46,12 @@ HOST, URL = "127.0.0.27", "udpm://239.255.76.67:7671?ttl=0"
 
 
 class Clock:
-    """time.monotonic in all of the process."""
+    """time.monotonic and time.sleep in all of the process."""
 
     now = 100.0
+
+    def sleep(self, seconds):
+        self.now += seconds
 
     def __call__(self):
         return self.now
@@ -58,6 +61,7 @@ class Clock:
 def clock(monkeypatch):
     clock = Clock()
     monkeypatch.setattr("time.monotonic", clock)
+    monkeypatch.setattr("time.sleep", clock.sleep)
     return clock
 
 
@@ -302,11 +306,19 @@ def test_each_command_is_passed_on_once_and_while_it_is_fresh(
     assert len(robot.commands) == 2
 
 
-def test_who_lets_go_may_be_followed_by_one_with_another_clock(lcm, bridge, robot):
+def test_who_lets_go_may_be_followed_by_one_with_another_clock(
+    lcm, clock, bridge, robot
+):
     send(lcm, COMMAND_CHANNEL, command(5_000_000))
     send(lcm, COMMAND_CHANNEL, command(1_000_000))
     assert len(robot.commands) == 1
     send(lcm, COMMAND_CHANNEL, command(5_000_001, engaged=False, position=math.nan))
+    # One of before that comes only now must not engage the arm again.
+    bridge.step()
+    send(lcm, COMMAND_CHANNEL, command(4_999_999))
+    assert [engaged for _, engaged in robot.commands] == [True, False]
+    clock.now += 1.1
+    bridge.step()
     send(lcm, COMMAND_CHANNEL, command(1_000_000))
     assert [engaged for _, engaged in robot.commands] == [True, False, True]
 
@@ -397,6 +409,8 @@ def test_the_bundled_file_knows_the_objects_of_the_bundled_scenarios():
         ("{url: here}", "lab: lcm.url is 'here'; it must be such as 'udpm://239.255"),
         ("{url: 'udpm://10.0.0.1:7667'}", "lcm.url is 'udpm://10.0.0.1:7667'"),
         ("{url: 'udpm://300.1.1.1:7667'}", "lcm.url is 'udpm://300.1.1.1:7667'"),
+        ("{url: 'udpm://239.1.1.1:76670'}", "lcm.url is 'udpm://239.1.1.1:76670'"),
+        ("{url: 'udpm://239.1.1.1:7667?ttl=256'}", "lcm.url is .*ttl=256"),
         ("{objects: [a, a]}", "lcm.objects must name different objects"),
         ("{object: [a]}", "object: there is no such key"),
     ],

@@ -16,6 +16,7 @@ import pytest
 from rhp_drake.drivers.natnet_config import NatNetConfig, PoseConfig
 from rhp_drake.drivers.natnet_driver import NatNetDriver
 from rhp_drake.errors import InputError, WorkError
+from rhp_drake.lab import natnet_server
 from rhp_drake.lab.natnet_server import Freeze, NatNetServer
 from rhp_drake.random_streams import stream
 
@@ -310,8 +311,18 @@ def test_nobody_answers(server):
 def test_an_address_that_is_not_ours(server):
     # One of TEST-NET-1.
     driver = make_driver(server, local_address="192.0.2.1")
-    with pytest.raises(WorkError, match=r"no NatNet server at .* assign"):
+    with pytest.raises(WorkError, match=r"server at .*, from 192\.0\.2\.1: .*assign"):
         driver.start()
+
+
+def test_names_that_cannot_be_read(server, monkeypatch):
+    definitions = natnet_server._definitions
+    monkeypatch.setattr(natnet_server, "_definitions", lambda ids: definitions(ids)[:9])
+    driver = make_driver(server)
+    others = multiprocessing.active_children()
+    with pytest.raises(WorkError, match="it sends frames, but no names that can be re"):
+        driver.start()
+    assert multiprocessing.active_children() == others
 
 
 def test_a_taken_port(server):
@@ -385,13 +396,16 @@ def test_config_loads_from_yaml():
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (NatNetConfig(), "different names"),
-        (NatNetConfig(bodies=["a", "a"]), "different names"),
-        (NatNetConfig(bodies=["a"], X_RB={"b": PoseConfig()}), "X_RB"),
-        (NatNetConfig(bodies=["a"], X_WO=PoseConfig(xyz=[0.0])), "finite"),
+        (NatNetConfig(), "natnet.bodies must name different"),
+        (NatNetConfig(bodies=["a", "a"]), "natnet.bodies must name different"),
+        (NatNetConfig(bodies=["a"], X_RB={"b": PoseConfig()}), "natnet.X_RB has"),
+        (
+            NatNetConfig(bodies=["a"], X_WO=PoseConfig(xyz=[0.0])),
+            "natnet.X_WO: a pose is three finite numbers",
+        ),
         (
             NatNetConfig(bodies=["a"], X_RB={"a": PoseConfig(xyz=[0, 0, math.nan])}),
-            "finite",
+            "natnet.X_RB.a: a pose is three finite numbers",
         ),
     ],
 )

@@ -161,7 +161,7 @@ def test_expanded_scenario_loads_again(tmp_path):
         ("", ": expected a mapping of names to values."),
         ("- a", ": expected a mapping of names to values."),
         ("seed: 3", ": seed: expected a scenario with its name before it, "),
-        ("a: {}\nb: {}", ": has several scenarios, choose one by name: a, b."),
+        ("a: {}\nb: {}", ": has several scenarios where one has to be chosen: a, b."),
     ],
 )
 def test_bad_file(tmp_path, text, message):

@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+import socket
 import time
 
 import numpy as np
@@ -13,7 +14,7 @@ from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.drivers.ur_driver import UrDriver
 from rhp_drake.errors import InputError
 from rhp_drake.lab.modes import RobotMode, RuntimeState
-from rhp_drake.lab.rtde_server import Stream
+from rhp_drake.lab.rtde_server import RTDE_PORT, Stream
 from rhp_drake.safety import Fault, JointLimits
 from rhp_drake.station.ports import COMMAND_PERIOD
 
@@ -247,6 +248,15 @@ def test_nobody_answers():
     driver = make_driver(host="127.0.0.24")
     with pytest.raises(InputError, match=r"cannot be used: .*127\.0\.0\.24 at 30004"):
         driver.start()
+
+
+def test_somebody_listens_and_does_not_answer(capfd):
+    with socket.create_server(("127.0.0.24", RTDE_PORT)):
+        driver = make_driver(host="127.0.0.24", connection_timeout=4.0)
+        with pytest.raises(InputError, match="cannot be used: no answer within 4 s"):
+            driver.start()
+    # Nothing has moved, and there is no watchdog yet.
+    assert "watchdog" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ def test_an_arm_that_is_let_go_on_its_way_is_stopped():
         dut.command(q)
         assert dut.cycle() == Fault.NONE
     dut.command(START, engaged=False)
-    assert dut.cycle() == Fault.STALE_COMMAND
+    assert dut.cycle() == Fault.LET_GO
 
 
 def test_a_robot_that_does_not_take_a_command_gets_no_other():
@@ -214,6 +214,26 @@ def test_a_robot_that_tells_nonsense_gets_nothing_more(name, value, monkeypatch)
     dut.stream.run(stopping)
     assert dut.stream._fault == Fault.IMPLAUSIBLE_MEASUREMENT
     assert len(robot.sent) == 2
+    # What it told before is what is passed on.
+    measured, _ = dut.stream._measurements.read()
+    np.testing.assert_array_equal(measured[:12], [*START, *np.zeros(6)])
+
+
+def test_after_another_fault_too_a_lost_connection_ends_the_driver():
+    """Else ur_rtde would upload its program anew, which has no watchdog."""
+    robot = Robot()
+    dut = Cycles(robot)
+    dut.command(np.full(6, np.nan))
+    ticks = iter(range(100))
+
+    def stopping():
+        if next(ticks) == 3:
+            robot.isConnected = lambda: False
+        return False
+
+    dut.stream.run(stopping)
+    assert dut.stream._fault == Fault.NOT_FINITE
+    assert next(ticks) < 10
 
 
 def test_who_is_told_to_stop_stops_the_arm():
@@ -240,6 +260,24 @@ def test_the_period_is_the_controllers(register, period, monkeypatch):
     dut = Cycles(None)
     dut.stream.connect()
     assert dut.stream._period == period
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("getRobotMode", RobotMode.POWER_OFF, "the robot is off"),
+        ("getSafetyMode", SafetyMode.PROTECTIVE_STOP, "in a protective stop"),
+    ],
+)
+def test_a_robot_that_cannot_move_is_sent_no_program(name, value, message, monkeypatch):
+    robot = Robot()
+    setattr(robot, name, lambda: int(value))
+    connect(monkeypatch, robot)
+    monkeypatch.setattr("rtde_control.RTDEControlInterface", None)
+    dut = Cycles(None)
+    with pytest.raises(RuntimeError, match=message):
+        dut.stream.connect()
+    assert not dut.stream.is_connected
 
 
 def test_without_a_watchdog_nothing_moves(monkeypatch):

@@ -128,6 +128,16 @@ def test_bundled_files_are_read(name):
         ("lab: {ur: {host: ''}}", "lab: ur.host: the robot's address is missing"),
         ("lab: {ur: {host: a, gain: high}}", "gain"),
         (
+            "lab: {ur: {host: a, limits: {velocity_limit: 4}}}",
+            "lab: ur.limits.velocity_limit: 4.0; it must be positive, and at most 3.14",
+        ),
+        ("lab: {ur: {host: a}}", "lab: natnet.bodies must name different rigid bodies"),
+        (
+            "lab: {lcm: {}, ur: {host: a, gain: 1}}",
+            "lab: ur.gain is 1.0; it must be from 100 to 2000",
+        ),
+        ("a: {}\nb: {}", "has several labs where one has to be chosen: a, b"),
+        (
             "lab: {ur: {host: a}, kinematics: {delta_d: [0.1, 0.2]}}",
             r"lab: kinematics.delta_d is \[0.1, 0.2\]; it must be six finite numbers",
         ),
@@ -189,7 +199,7 @@ def test_the_arm_is_stopped_first_and_each_even_if_the_other_fails(monkeypatch):
 
 def test_the_default_is_to_hold_still(tmp_path):
     path = tmp_path / "lab.yaml"
-    path.write_text("lab: {ur: {host: robot}}")
+    path.write_text("lab: {ur: {host: robot}, natnet: {bodies: [a]}}")
     assert load_hardware(path).ur.dry_run
 
 
@@ -199,7 +209,7 @@ def test_the_documentation_says_the_defaults():
     for words in (
         f"no command for {1000 * ur.command_timeout:.0f} ms",
         f"or {ur.patience:g} s (`ur.patience`)",
-        f"frozen for {1000 * ur.measurement_timeout:.0f} ms",
+        f"nothing new from the robot for {1000 * ur.measurement_timeout:.0f} ms",
         f"not seen for {1000 * guard.object_age_limit:.0f} ms",
         f"not heard of for {1000 * guard.arm_age_limit:.0f} ms",
         f"watchdog ({ur_stream._WATCHDOG_FREQUENCY:.0f} Hz)",

@@ -52,6 +52,7 @@ def driver(
                 objects,
                 config.ur.command_timeout,
             )
+            task_run.say_motion(console, dry_run=config.ur.dry_run)
             console.print(f"At {lcm.url}.  Ctrl-C stops the arm and ends.")
             while True:
                 new_fault = bridge.step()

@@ -129,8 +129,9 @@ def _run(
                 m = len(scenario.station.objects)
                 running = stack.enter_context(running_hardware(config, m))
                 if config.lcm is None:
-                    moves = "does not move: dry_run" if config.ur.dry_run else "moves"
-                    console.print(f"The arm {moves}.", style="bold")
+                    task_run.say_motion(console, dry_run=config.ur.dry_run)
+                else:
+                    console.print("The driver says whether the arm moves.")
             simulator = task_run.make_simulator(
                 scenario, policy, meshcat, realtime, running
             )

@@ -111,6 +111,12 @@ def say_title(
         console.print(f"Meshcat: {meshcat.web_url()}")
 
 
+def say_motion(console: "Console", *, dry_run: bool) -> None:
+    """Says whether a real arm is about to move."""
+    moves = "does not move: dry_run" if dry_run else "moves"
+    console.print(f"The arm {moves}.", style="bold")
+
+
 @contextmanager
 def recorded(meshcat: "Meshcat | None", folder: Path) -> Iterator[None]:
     """Records what happens, and writes it to recording.html in `folder`."""

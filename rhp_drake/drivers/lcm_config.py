@@ -11,7 +11,7 @@ COMMAND_CHANNEL: Final = "UR_COMMAND"
 STATUS_CHANNEL: Final = "UR_STATUS"
 POSES_CHANNEL: Final = "OBJECT_POSES"
 
-_URL: Final = re.compile(r"udpm://([0-9.]+):([0-9]{1,5})(\?ttl=[0-9]{1,3})?")
+_URL: Final = re.compile(r"udpm://([0-9.]+):([0-9]{1,5})(?:\?ttl=([0-9]{1,3}))?")
 
 
 @dataclass
@@ -33,7 +33,12 @@ class LcmConfig:
         """Raises an InputError if the URL is none, or an object is named twice."""
         parts = _URL.fullmatch(self.url)
         try:
-            good = parts is not None and ipaddress.IPv4Address(parts[1]).is_multicast
+            good = (
+                parts is not None
+                and ipaddress.IPv4Address(parts[1]).is_multicast
+                and 0 < int(parts[2]) < 2**16
+                and int(parts[3] or 0) < 2**8
+            )
         except ipaddress.AddressValueError:
             good = False
         # Drake itself would say it on the console, and go on without LCM.

@@ -23,20 +23,19 @@ class PoseConfig:
     xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
-    def to_transform(self) -> "RigidTransform":
-        """The pose.
-
-        Raises:
-            InputError: If it is not six finite numbers.
-        """
-        from pydrake.math import RigidTransform, RollPitchYaw
-
+    def validate(self, where: str) -> None:
+        """Raises an InputError that begins with `where` unless it is a pose."""
         numbers = [*self.xyz, *self.rpy_deg]
         if not (len(self.xyz) == len(self.rpy_deg) == 3 and np.isfinite(numbers).all()):
             raise InputError(
-                "a pose is three finite numbers xyz and three rpy_deg, not "
+                f"{where}: a pose is three finite numbers xyz and three rpy_deg, not "
                 f"{self.xyz} and {self.rpy_deg}."
             )
+
+    def to_transform(self) -> "RigidTransform":
+        """The pose, which must be valid."""
+        from pydrake.math import RigidTransform, RollPitchYaw
+
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz)
 
 
@@ -69,6 +68,23 @@ class NatNetConfig:
     bodies: list[str] = field(default_factory=list)
     X_WO: PoseConfig = field(default_factory=PoseConfig)
     X_RB: dict[str, PoseConfig] = field(default_factory=dict)
+
+    def validate(self) -> None:
+        """Raises an InputError that names the first impossible value."""
+        names = self.bodies
+        if not names or len(set(names)) < len(names):
+            raise InputError(
+                f"natnet.bodies must name different rigid bodies, not {names}."
+            )
+        unknown = sorted(self.X_RB.keys() - set(names))
+        if unknown:
+            raise InputError(
+                f"natnet.X_RB has a pose for {listed(unknown)}, but the rigid bodies "
+                f"are {listed(names)}."
+            )
+        self.X_WO.validate("natnet.X_WO")
+        for name, pose in self.X_RB.items():
+            pose.validate(f"natnet.X_RB.{name}")
 
 
 def listed(names: list[str]) -> str:

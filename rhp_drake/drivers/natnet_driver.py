@@ -12,7 +12,7 @@ import time
 from typing import Final
 
 from rhp_drake.drivers.measurements import ObjectPose
-from rhp_drake.drivers.natnet_config import NatNetConfig, PoseConfig, listed
+from rhp_drake.drivers.natnet_config import NatNetConfig, PoseConfig
 from rhp_drake.drivers.natnet_receiver import START_TIME, receive
 from rhp_drake.drivers.pose_rows import POSE_SIZE, to_poses
 from rhp_drake.drivers.receiver_process import ReceiverProcess
@@ -34,22 +34,12 @@ class NatNetDriver:
         config: Where and what.
 
     Raises:
-        InputError: If `config` names no bodies or one twice, or a pose of X_WO and
-            X_RB is none, or is for a body that is not named.
+        InputError: If a value of `config` is impossible.
     """
 
     def __init__(self, config: NatNetConfig) -> None:
+        config.validate()
         names = config.bodies
-        if not names or len(set(names)) < len(names):
-            raise InputError(
-                f"the NatNet driver needs different names of rigid bodies, not {names}."
-            )
-        unknown = sorted(config.X_RB.keys() - set(names))
-        if unknown:
-            raise InputError(
-                f"X_RB has a pose for {listed(unknown)}, but the rigid bodies are "
-                f"{listed(names)}."
-            )
         self._config = config
         self._X_WO = config.X_WO.to_transform()
         self._X_RB = [config.X_RB.get(x, PoseConfig()).to_transform() for x in names]

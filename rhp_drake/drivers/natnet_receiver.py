@@ -83,6 +83,7 @@ class _Receiver:
         self._answer: Connection | None = answer
         self._rows = np.full((len(config.bodies), POSE_SIZE), np.nan)
         self._num_malformed = 0
+        self._give_up_at = time.monotonic() + START_TIME
         self._row_of_id: dict[int, int] = {}
         self._last_number = -math.inf
         # What natnet has received and nobody has looked at.
@@ -94,7 +95,6 @@ class _Receiver:
         from natnet import NatNetClient
 
         config = self._config
-        give_up_at = time.monotonic() + START_TIME
         self._Publish()
         while True:
             # A new one: an old one remembers much of the server before.
@@ -122,9 +122,7 @@ class _Receiver:
                 time.sleep(_RETRY_PERIOD)
             finally:
                 client.shutdown()
-            if time.monotonic() > give_up_at:
-                where = f"{config.server_address}:{config.command_port}"
-                self._Answer(WorkError(f"no NatNet server at {where}: {problem}."))
+            self._GiveUp(f"from {config.local_address}: {problem}")
 
     def _ReceiveFrom(self, client: Any) -> None:
         """Publishes what comes, until no new frame has come for `_SILENCE`.
@@ -163,6 +161,7 @@ class _Receiver:
                     heard = now
                     self._Publish()
             emptied = emptied_next
+            self._GiveUp("it sends frames, but no names that can be read")
             time.sleep(_POLL_PERIOD)
 
     def _TakeDefinitions(self, definitions: Any) -> None:
@@ -208,6 +207,12 @@ class _Receiver:
 
     def _Publish(self) -> None:
         self._vector.write(np.append(self._rows, self._num_malformed))
+
+    def _GiveUp(self, problem: str) -> None:
+        """Says what is wrong, if the start has taken too long."""
+        if time.monotonic() > self._give_up_at:
+            where = f"{self._config.server_address}:{self._config.command_port}"
+            self._Answer(WorkError(f"no NatNet server at {where}, {problem}."))
 
     def _Answer(self, error: Exception | None) -> None:
         """Says how the start went, unless that has been said; the parent ends it."""

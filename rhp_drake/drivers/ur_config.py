@@ -38,7 +38,7 @@ class UrDriverConfig:
         """Raises an InputError that names the first impossible value."""
         if not self.host:
             raise InputError("ur.host: the robot's address is missing.")
-        self.limits.validate()
+        self.limits.validate("ur.limits.")
         for name, low, high in (
             ("lookahead_time", 0.03, 0.2),
             ("gain", 100.0, 2000.0),

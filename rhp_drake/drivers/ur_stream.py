@@ -32,7 +32,7 @@ from rhp_drake.drivers.realtime import ask_for_realtime, leave_realtime
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.drivers.ur_config import UrDriverConfig
 from rhp_drake.drivers.ur_modes import PROGRAM_RUNNING, check_robot
-from rhp_drake.safety import NUM_JOINTS, Fault
+from rhp_drake.safety import NUM_JOINTS, Fault, describe
 
 # ur_rtde ignores speed and acceleration of servoJ, but checks their ranges.
 _UNUSED: Final = 0.5
@@ -66,6 +66,7 @@ _OURS: Final = (
     Fault.VELOCITY_LIMIT,
     Fault.TRACKING_ERROR,
     Fault.STALE_COMMAND,
+    Fault.LET_GO,
 )
 
 # Layout of the shared vectors.
@@ -95,6 +96,9 @@ def serve(
             if stream.is_stuck:
                 # Before the library uploads its program anew, without a watchdog.
                 os._exit(1)
+            if stopping.is_set() and not stream.is_connected:
+                # The library waits for the robot, and nothing moves yet.
+                os._exit(0)
         stopping.set()
         # Nobody is left to end what does not end by itself.
         time.sleep(STOP_TIME)
@@ -125,7 +129,11 @@ def serve(
 
 
 class Stream:
-    """The driver's loop: measure, check, command."""
+    """The driver's loop: measure, check, command.
+
+    Attributes:
+        is_connected: Whether the robot has been connected to, and may move.
+    """
 
     def __init__(
         self,
@@ -139,6 +147,7 @@ class Stream:
         self._commands = commands
         self._measurements = measurements
         self._shared_periods = periods
+        self.is_connected = False
         self._fault = Fault.NONE
         self._receive: Any = None
         self._control: Any = None
@@ -173,9 +182,10 @@ class Stream:
             try:
                 if self._receive.getTimestamp() != timestamp:
                     timestamp, heard_at = self._receive.getTimestamp(), now
-                position = np.array(self._receive.getActualQ())
-                velocity = np.array(self._receive.getActualQd())
-                fault = self._check_robot(now - heard_at, position, velocity)
+                measured = self._measure()
+                fault = self._check_robot(now - heard_at, *measured)
+                if fault != Fault.IMPLAUSIBLE_MEASUREMENT:
+                    position, velocity = measured
                 if fault == self._fault == Fault.NONE:
                     self._calling_since = now
                     fault = self._follow(position, now)
@@ -200,7 +210,8 @@ class Stream:
             # After it was told: to stop takes a while.
             if new_fault:
                 self._stop_arm()
-            if self._fault == Fault.CONNECTION_LOST:
+            # Whatever stopped the arm before.
+            if fault == Fault.CONNECTION_LOST:
                 # The library would connect anew and upload its program again and again.
                 return
             # Late once, it is not early afterwards.
@@ -220,6 +231,10 @@ class Stream:
 
         host = self._config.host
         self._receive = RTDEReceiveInterface(host, -1.0, _VARIABLES)
+        fault = self._check_robot(0.0, *self._measure())
+        if fault != Fault.NONE:
+            # Nor would it play the library's program.
+            raise RuntimeError(describe(fault))
         if not self._config.dry_run:
             self._control = RTDEControlInterface(host)
             # The answer is not waited for: the first time one reads what was in the
@@ -234,6 +249,12 @@ class Stream:
                 raise RuntimeError("it did not take the watchdog")
             # The first command after another kind of command waits, too.
             self._control.kickWatchdog()
+        self.is_connected = True
+
+    def _measure(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities of the joints, shape (6,) each, rad and rad/s."""
+        receive = self._receive
+        return np.array(receive.getActualQ()), np.array(receive.getActualQd())
 
     def _check_robot(
         self, age: float, position: np.ndarray, velocity: np.ndarray
@@ -265,8 +286,8 @@ class Stream:
             # Not engaged, or no more: then the next command has to be where the arm is
             # again.  The controller waits for a sign of life all the same.
             if self._follower.moving:
-                # Let go on its way, it would go on to what was sent last.
-                return Fault.STALE_COMMAND
+                # It would go on to what was sent last.
+                return Fault.LET_GO
             self._follower.let_go()
             self._sent_at = np.nan
             if self._control is not None:

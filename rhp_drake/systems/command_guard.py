@@ -50,18 +50,21 @@ class CommandGuardConfig(JointLimits):
     object_age_limit: float = 0.08
     arm_age_limit: float = 0.05
 
-    def validate(self) -> None:
-        """Raises an InputError if a limit is not positive."""
-        super().validate()
-        for name in (
-            "workspace_margin",
-            "height_tolerance",
-            "object_age_limit",
-            "arm_age_limit",
+    def validate(self, where: str = "guard.") -> None:
+        """Raises an InputError if a limit is impossible, or no limit at all."""
+        super().validate(where)
+        for name, largest in (
+            ("workspace_margin", 0.1),
+            ("height_tolerance", PUSHING_HEIGHT),
+            ("object_age_limit", 5.0),
+            ("arm_age_limit", 5.0),
         ):
             value = getattr(self, name)
-            if not value > 0:
-                raise InputError(f"guard.{name} is {value}; it must be positive.")
+            if not 0 < value <= largest:
+                raise InputError(
+                    f"{where}{name} is {value}; it must be positive, and at most "
+                    f"{largest:g}."
+                )
 
 
 class CommandGuard(LeafSystem):
