@@ -425,7 +425,12 @@ def test_bad_files(text, message, tmp_path):
 # Patient where computers may be slow; not where a planner is dead.
 LAB = f"""
 lab:
-  ur: {{host: {HOST}, command_timeout: 1.0, measurement_timeout: 1.0, patience: 2.0}}
+  ur:
+    host: {HOST}
+    dry_run: false
+    command_timeout: 1.0
+    measurement_timeout: 1.0
+    patience: 2.0
   natnet: {{server_address: {HOST}, bodies: [target, obstacle_1, obstacle_2]}}
   lcm: {{url: "{URL}", objects: [target, obstacle_1, obstacle_2]}}
 """

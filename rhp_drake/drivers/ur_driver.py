@@ -86,15 +86,19 @@ class UrDriver:
         self._end = weakref.finalize(self, _end, self._process, self._stopping)
         self._sender.close()  # Else the pipe does not end with the process.
         deadline = time.monotonic() + self._config.connection_timeout
-        while np.isnan(self.read().position).any():
-            if time.monotonic() > deadline or not self._process.is_alive():
-                problem = self._read_problem()
-                self.stop()
-                raise InputError(
-                    f"ur.host: the robot at {self._config.host} cannot be used: "
-                    f"{problem}."
-                )
-            time.sleep(0.01)
+        try:
+            while np.isnan(self.read().position).any():
+                if time.monotonic() > deadline or not self._process.is_alive():
+                    raise InputError(
+                        f"ur.host: the robot at {self._config.host} cannot be used: "
+                        f"{self._read_problem()}."
+                    )
+                time.sleep(0.01)
+        except BaseException:
+            # Nothing has moved yet, and the library may wait for the robot for long.
+            self._process.kill()
+            self.stop()
+            raise
 
     def _read_problem(self) -> str:
         """What ur_rtde said, or that nothing was heard."""

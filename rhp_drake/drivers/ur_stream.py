@@ -96,9 +96,6 @@ def serve(
             if stream.is_stuck:
                 # Before the library uploads its program anew, without a watchdog.
                 os._exit(1)
-            if stopping.is_set() and not stream.is_connected:
-                # The library waits for the robot, and nothing moves yet.
-                os._exit(0)
         stopping.set()
         # Nobody is left to end what does not end by itself.
         time.sleep(STOP_TIME)
@@ -129,11 +126,7 @@ def serve(
 
 
 class Stream:
-    """The driver's loop: measure, check, command.
-
-    Attributes:
-        is_connected: Whether the robot has been connected to, and may move.
-    """
+    """The driver's loop: measure, check, command."""
 
     def __init__(
         self,
@@ -147,7 +140,6 @@ class Stream:
         self._commands = commands
         self._measurements = measurements
         self._shared_periods = periods
-        self.is_connected = False
         self._fault = Fault.NONE
         self._receive: Any = None
         self._control: Any = None
@@ -249,7 +241,6 @@ class Stream:
                 raise RuntimeError("it did not take the watchdog")
             # The first command after another kind of command waits, too.
             self._control.kickWatchdog()
-        self.is_connected = True
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities of the joints, shape (6,) each, rad and rad/s."""
