@@ -266,13 +266,16 @@ def test_flat_arrays_agree_with_the_rows(folder, data):
         np.testing.assert_array_equal(
             data.search_next_states[of_search], row["search_next_states"]
         )
-        origins = np.array(row["search_origins"])
-        ways = np.array(row["search_next_states"], np.float32)
-        before = np.where(origins[:, None] < 0, row["initial_state"], ways[origins])
-        np.testing.assert_array_equal(
-            data.search_states[of_search], before.astype(np.float32)
-        )
     assert len(data.search_actions) == sum(row["num_transitions"] for row in rows)
+    roots = data.search_origins < 0
+    np.testing.assert_array_equal(
+        data.search_states[~roots],
+        data.search_next_states[data.search_origins[~roots]],
+    )
+    initial = np.array([row["initial_state"] for row in rows], np.float32)
+    np.testing.assert_array_equal(
+        data.search_states[roots], initial[data.search_tasks[roots]]
+    )
 
 
 def test_plans_end_at_the_goal(data):
@@ -290,11 +293,13 @@ def test_folders_join(folder, data):
     both = load_dataset([folder, folder / "tasks_0000000.parquet"])
     assert len(both.goals) == 2 * len(data.goals)
     n = len(data.search_actions)
-    np.testing.assert_array_equal(both.search_tasks[:n], data.search_tasks)
+    second = both.search_origins[n:]
+    np.testing.assert_array_equal(both.search_origins[:n], data.search_origins)
+    np.testing.assert_array_equal(second < 0, data.search_origins < 0)
+    linked = second >= 0
     np.testing.assert_array_equal(
-        both.goals[both.search_tasks[n:]], data.goals[data.search_tasks]
+        both.search_next_states[second[linked]], both.search_states[n:][linked]
     )
-    np.testing.assert_array_equal(both.search_states[n:], data.search_states)
 
 
 def test_seeds_and_actions_rebuild_the_states(folder, tmp_path):
@@ -309,6 +314,11 @@ def test_seeds_and_actions_rebuild_the_states(folder, tmp_path):
     # Each plan is one chain of transitions.
     np.testing.assert_array_equal(rebuilt.search_states, ours.plan_states)
     np.testing.assert_array_equal(rebuilt.search_actions, ours.plan_actions)
+    linked = rebuilt.search_origins >= 0
+    assert (~linked).sum() == solved
+    np.testing.assert_array_equal(
+        rebuilt.search_origins[linked], np.flatnonzero(linked) - 1
+    )
     assert describe(full)["demonstrator"] == describe(folder)["demonstrator"]
 
     (replay,) = verify([folder / "tasks_0000000.parquet"], 1)
@@ -364,4 +374,9 @@ def test_the_oldest_transitions_go_first(folder):
     rest = without_oldest(data, 10)
     np.testing.assert_array_equal(rest.search_states, data.search_states[10:])
     np.testing.assert_array_equal(rest.plan_states, data.plan_states)
-    np.testing.assert_array_equal(rest.search_tasks, data.search_tasks[10:])
+    linked = rest.search_origins >= 0
+    np.testing.assert_array_equal(
+        rest.search_next_states[rest.search_origins[linked]],
+        rest.search_states[linked],
+    )
+    assert (data.search_origins[10:][~linked] < 10).all()

@@ -19,11 +19,12 @@ from rhp_drake.learning.imitation import (
     return_of,
 )
 from rhp_drake.learning.reinforcement import Reinforcement, Rounds
-from rhp_drake.learning.sampling import sample
+from rhp_drake.learning.sampling import _go_back, sample
 from rhp_drake.push_model.transition import PushModel
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
     Action,
+    goals_reached,
     hand_targets,
     object_positions,
 )
@@ -95,12 +96,33 @@ def test_double_q_targets_by_hand():
     torch.testing.assert_close(targets, torch.tensor([-8.0, -41.0, -1.0, -41.0]))
 
 
-def test_samples_are_what_was_simulated(data):
-    samples = sample([data, data], 301, stream(1))
-    after = PushModel(3).step(samples.states.astype(float), samples.actions.astype(int))
-    difference = object_positions(after) - object_positions(samples.next_states)
-    # Stored in single precision.
+def test_hindsight_goals_are_reached_in_time(data):
+    """Following the search from a sample to its end meets the goals it was given."""
+    samples = sample([data], 4000, stream(1), hindsight=0.5)
+    known = np.isfinite(samples.least_returns)
+    assert known.mean() > 0.05
+    # One action is enough where the least return says so.
+    one = known & (samples.least_returns == -1.0)
+    assert one.sum() > 10
+    assert goals_reached(samples.next_states[one], samples.goals[one]).all()
+    push_model = PushModel(3)
+    after = push_model.step(
+        samples.states[:200].astype(float), samples.actions[:200].astype(int)
+    )
+    difference = object_positions(after) - object_positions(samples.next_states[:200])
     assert np.median(np.abs(difference)) < 1e-5
+
+
+def test_hindsight_counts_actions(data):
+    """From each transition, so many actions lead to the end."""
+    ends = np.arange(len(data.search_actions))
+    rows, num_actions = _go_back(data, ends, stream(1))
+    assert num_actions.max() > 3
+    for row, count, end in zip(rows, num_actions, ends, strict=True):
+        way = [end]
+        while way[-1] != row:
+            way.append(data.search_origins[way[-1]])
+        assert len(way) == count
 
 
 def test_the_loss_of_imitation_may_stay(data):

@@ -1,9 +1,9 @@
 """Stable-Baselines3's DQN from scratch, on the Gymnasium environment: a baseline.
 
 It has the actions, and the observations and layers of the paper's Q-network, and none
-of what we give ours: no demonstrations, no look-ahead, no double Q-learning, no
-symmetries, no set of obstacles.  What it learns becomes a `QNetwork`, so that the same
-greedy policy, with the same mask, is measured.
+of what we give ours: no demonstrations, no look-ahead, no goals in hindsight, no double
+Q-learning, no symmetries, no set of obstacles.  What it learns becomes a `QNetwork`, so
+that the same greedy policy, with the same mask, is measured.
 
 Stable-Baselines3 draws from its own generators, and from those of Python, NumPy and
 PyTorch; it sets their seeds.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rhp_drake.benchmarks.reinforcement import TrainingResult
 
 _VARIANTS = (
-    "best,from_scratch,executed_only,paper_network,no_symmetry,"
+    "best,from_scratch,executed_only,no_hindsight,paper_network,no_symmetry,"
     "plans_only,no_double_q,epsilon_greedy,uncertain_physics,paper"
 )
 

@@ -27,6 +27,7 @@ class Dataset:
         search_states: Shape (T, 3 + 3 m).
         search_actions: Shape (T,).
         search_next_states: Shape (T, 3 + 3 m).
+        search_origins: For each transition, which one led to its state; -1 at a root.
         solved: Whether each task has a plan, shape (P,).
     """
 
@@ -39,6 +40,7 @@ class Dataset:
     search_states: np.ndarray
     search_actions: np.ndarray
     search_next_states: np.ndarray
+    search_origins: np.ndarray
     solved: np.ndarray
 
 
@@ -52,8 +54,12 @@ _COLUMNS: Final = (
     "search_origins",
     "search_next_states",
 )
-# Arrays that hold numbers of tasks.
-_INDICES: Final = ("plan_tasks", "search_tasks")
+# Arrays that hold indices, and the array whose rows they count.
+_INDICES: Final = {
+    "plan_tasks": "goals",
+    "search_tasks": "goals",
+    "search_origins": "search_actions",
+}
 
 
 def load_dataset(paths: Sequence[Path]) -> Dataset:
@@ -81,9 +87,10 @@ def _flatten(path: Path, table: pa.Table) -> Dataset:
     next_states = numbers(table["search_next_states"])
     origins = numbers(table["search_origins"])
     first = np.repeat(np.cumsum(num_transitions) - num_transitions, num_transitions)
+    origins = np.where(origins < 0, -1, origins + first).astype(np.int32)
     initial_states = numbers(table["initial_state"]).astype(np.float32)
     at_root = origins < 0
-    search_states = next_states[origins + first]
+    search_states = next_states[origins]
     search_states[at_root] = initial_states[search_tasks[at_root]]
     plan_ends = np.cumsum(plan_lengths)
     return Dataset(
@@ -98,6 +105,7 @@ def _flatten(path: Path, table: pa.Table) -> Dataset:
         search_states=search_states,
         search_actions=numbers(table["search_actions"]),
         search_next_states=next_states,
+        search_origins=origins,
         solved=table["solved"].to_numpy(),
     )
 
@@ -105,12 +113,14 @@ def _flatten(path: Path, table: pa.Table) -> Dataset:
 def without_oldest(data: Dataset, num_transitions: int) -> Dataset:
     """The dataset without its first so many transitions; the plans stay."""
     kept = slice(num_transitions, None)
+    origins = data.search_origins[kept] - num_transitions
     return replace(
         data,
         search_tasks=data.search_tasks[kept],
         search_states=data.search_states[kept],
         search_actions=data.search_actions[kept],
         search_next_states=data.search_next_states[kept],
+        search_origins=np.maximum(origins, -1),
     )
 
 
@@ -122,14 +132,15 @@ def concatenate(parts: Sequence[Dataset]) -> Dataset:
     """
     if len({part.goals.shape[1] for part in parts}) > 1:
         raise InputError("the demonstrations are of different numbers of objects.")
-    num_tasks = [len(part.goals) for part in parts]
-    offsets = np.cumsum([0, *num_tasks[:-1]], dtype=np.int32)
     arrays = {}
     for field in fields(Dataset):
         values = [getattr(part, field.name) for part in parts]
         if field.name in _INDICES:
+            sizes = [len(getattr(part, _INDICES[field.name])) for part in parts]
+            offsets = np.cumsum([0, *sizes[:-1]], dtype=np.int32)
             values = [
-                value + offset for value, offset in zip(values, offsets, strict=True)
+                np.where(value < 0, value, value + offset)
+                for value, offset in zip(values, offsets, strict=True)
             ]
         arrays[field.name] = np.concatenate(values)
     return Dataset(**arrays)

@@ -36,6 +36,7 @@ class FittedQConfig:
         discount: gamma.
         l2: See `LearnerConfig`, as the next three.
         target_rate: How far the target network follows at each step.
+        hindsight: How many of a batch's samples get goals in hindsight.
         double_q: Whether the target's action is the network's choice, not the target
             network's own.
         symmetry: Whether samples are seen through random symmetries.
@@ -51,6 +52,7 @@ class FittedQConfig:
     batch_size: int = 1024
     num_steps: int = 40_000
     target_rate: float = 0.005
+    hindsight: float = 0.5
     double_q: bool = True
     symmetry: bool = True
     squared_errors: bool = False
@@ -94,7 +96,7 @@ class FittedQ(Learner):
         sources: What was simulated; each has the same share of a batch, so that a few
             roll-outs count beside many searches.
         config: How.
-        generator: Draws the batches and their symmetries.
+        generator: Draws the batches, their goals and symmetries.
 
     Attributes:
         sources: The same; more may be added.
@@ -134,7 +136,12 @@ class FittedQ(Learner):
 
     def _loss(self) -> torch.Tensor:
         config = self._config
-        batch = sample(self.sources, config.batch_size, self._generator)
+        batch = sample(
+            self.sources,
+            config.batch_size,
+            self._generator,
+            hindsight=config.hindsight,
+        )
         network = self.network
         symmetry = (
             Symmetry(
@@ -163,7 +170,7 @@ class FittedQ(Learner):
         next_states = symmetry.states(self._tensor(batch.next_states))
         allowed = self._tensor(allowed_actions(batch.next_states))
         target_q_next = self._target(next_states, goals)
-        return double_q_targets(
+        targets = double_q_targets(
             self.network(next_states, goals) if config.double_q else target_q_next,
             target_q_next,
             symmetry.action_masks(allowed),
@@ -171,6 +178,8 @@ class FittedQ(Learner):
             self._tensor(objects_fallen(batch.next_states)),
             config.discount,
         )
+        least = self._tensor(batch.least_returns).float()
+        return torch.maximum(targets, least)
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         """The array where the network is."""

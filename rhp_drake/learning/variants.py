@@ -39,6 +39,7 @@ BEST: Final = Variant()
 PAPER: Final = Variant(
     learning=FittedQConfig(
         learning_rate=1e-4,
+        hindsight=0.0,
         double_q=False,
         squared_errors=True,
         imitation_weight=0.1,
@@ -53,6 +54,7 @@ VARIANTS: Final = {
     "best": BEST,
     "from_scratch": replace(BEST, from_scratch=True),
     "executed_only": replace(BEST, rounds=_acting(executed_only=True)),
+    "no_hindsight": replace(BEST, learning=replace(_LEARNING, hindsight=0.0)),
     "paper_network": replace(BEST, network="paper"),
     "no_symmetry": replace(BEST, learning=replace(_LEARNING, symmetry=False)),
     "plans_only": replace(BEST, plans_only=True),
