@@ -190,7 +190,7 @@ def _fault_table(injections: "Sequence[Injection]") -> "Table":
         show_edge=False,
     )
     table.add_column("what goes wrong", no_wrap=True)
-    for heading in ("runs", "moving", "ended", "named", "ms", "longest"):
+    for heading in ("runs", "moving", "ended", "named", "ms", "max"):
         table.add_column(heading, justify="right")
     for row in summarize(injections):
         median, longest = row.hold_ms
