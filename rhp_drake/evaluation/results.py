@@ -1,26 +1,7 @@
-"""A folder of results: one row an episode, in Parquet.
+"""A folder of results: files of episodes, and what they have in common.
 
-``pandas.read_parquet(folder / "episodes")`` reads all of it.
-
-| column | type | what |
-| --- | --- | --- |
-| `policy`, `weights` | string | who decided, and its Q-network; "" if it has none |
-| `level` | string | of the physics' uncertainty: none, low, medium, high |
-| `instance` | int32 | which of the set |
-| `trial` | int32 | which of the trials on this instance; each has physics of its own |
-| `outcome` | string | "succeeded", or why it failed |
-| `succeeded` | bool | whether all objects ended in their goal regions |
-| `num_actions` | int32 | L, actions executed |
-| `actions` | list of int8 | the actions, `task.Action` |
-| `states` | list of float[3 + 3 m] | before each action and at the end |
-| `decision_seconds` | list of float | computation of each decision |
-| `world_seconds` | double | computation of the world |
-| `simulated_seconds` | double | how long it took in the world; 0 without time |
-| `ending` | string | of a failure: what was outside its goal region, and loops |
-
-All but `decision_seconds` and `world_seconds` depend on the experiment alone, as long
-as no run and no search reaches its limit of computation.  The metadata of each file
-have the key "rhp_drake": JSON with commit of the code and machine.
+``pandas.read_parquet(folder / "episodes")`` reads all of them; `episode_files` explains
+the columns.
 
 `settings.json` beside it says what all rows have in common (instances, number of
 objects, world, seed) and what each column's policy is.  A batch of episodes is a file;
@@ -28,19 +9,20 @@ work that is stopped goes on with the batches that are not there.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 import hashlib
 import json
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from rhp_drake.errors import InputError
 from rhp_drake.evaluation.episode import Episode
+from rhp_drake.evaluation.episode_files import (
+    num_episodes,
+    read_episodes,
+    write_episodes,
+)
 from rhp_drake.evaluation.experiment import (
     Batch,
     Column,
@@ -50,7 +32,6 @@ from rhp_drake.evaluation.experiment import (
 )
 from rhp_drake.evaluation.paper_results import SHIPPED_WEIGHTS
 from rhp_drake.files import exclusive, write_atomically
-from rhp_drake.learning.demonstration_files import lengths, numbers
 from rhp_drake.physics import UNCERTAINTY_LEVELS
 from rhp_drake.planning.policy_config import POLICIES, PolicyConfig
 from rhp_drake.resources import resolve
@@ -59,7 +40,6 @@ from rhp_drake.workers import Workers
 _FORMAT: Final = "rhp_drake results 1"
 _SETTINGS: Final = "settings.json"
 _EPISODES: Final = "episodes"
-_METADATA_KEY: Final = b"rhp_drake"
 # The setting that says what each column's policy is.
 _COLUMNS: Final = "columns"
 
@@ -113,7 +93,7 @@ def run_experiment(
         missing = []
         done = 0
         for batch in experiment.batches():
-            there = _num_rows(_path(folder, batch))
+            there = num_episodes(_path(folder, batch))
             if there < len(batch.indices):
                 missing.append(batch)
             else:
@@ -121,10 +101,7 @@ def run_experiment(
         yield done
         about = {"commit": commit, "machine": machine}
         for batch, episodes in run_batches(experiment, missing, workers):
-            table = _to_table(batch.trials(), episodes, about)
-            sink = pa.BufferOutputStream()
-            pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
-            write_atomically(_path(folder, batch), sink.getvalue().to_pybytes())
+            write_episodes(_path(folder, batch), batch.trials(), episodes, about)
             done += len(episodes)
             yield done
 
@@ -144,8 +121,8 @@ def read_results(folder: Path) -> Results:
     abouts: list[dict[str, str]] = []
     seen: set[Trial] = set()
     for path in sorted((folder / _EPISODES).glob("*.parquet")):
-        table = _read_table(path)
-        for trial, episode in _from_table(table):
+        of_file, about = read_episodes(path)
+        for trial, episode in of_file:
             if trial.column not in order or trial.level not in levels:
                 raise InputError(
                     f"{path}: holds episodes of {trial.column} ({trial.level}), which "
@@ -155,7 +132,7 @@ def read_results(folder: Path) -> Results:
                 raise InputError(f"{path}: holds episodes that another file has, too.")
             seen.add(trial)
             episodes.append((trial, episode))
-        abouts.append(json.loads(table.schema.metadata[_METADATA_KEY]))
+        abouts.append(about)
     if not episodes:
         raise InputError(f"{folder}: holds no episodes yet.")
     episodes.sort(
@@ -298,95 +275,3 @@ def _read_settings(folder: Path) -> dict[str, Any]:
             raise
         raise InputError(f"{path}: not readable settings ({error}).") from error
     return settings
-
-
-def _schema(num_values: int, about: dict[str, str]) -> pa.Schema:
-    """The columns described above, for states of so many values."""
-    return pa.schema(
-        {
-            "policy": pa.string(),
-            "weights": pa.string(),
-            "level": pa.string(),
-            "instance": pa.int32(),
-            "trial": pa.int32(),
-            "outcome": pa.string(),
-            "succeeded": pa.bool_(),
-            "num_actions": pa.int32(),
-            "actions": pa.list_(pa.int8()),
-            "states": pa.list_(pa.list_(pa.float32(), num_values)),
-            "decision_seconds": pa.list_(pa.float32()),
-            "world_seconds": pa.float64(),
-            "simulated_seconds": pa.float64(),
-            "ending": pa.string(),
-        },
-        metadata={_METADATA_KEY: json.dumps(about).encode()},
-    )
-
-
-def _to_table(
-    trials: Sequence[Trial], episodes: Sequence[Episode], about: dict[str, str]
-) -> pa.Table:
-    rows = [
-        {
-            "policy": trial.column.policy,
-            "weights": trial.column.weights,
-            "level": trial.level,
-            "instance": trial.index,
-            "trial": trial.number,
-            "outcome": episode.outcome,
-            "succeeded": episode.succeeded,
-            "num_actions": episode.num_actions,
-            "actions": list(episode.actions),
-            "states": list(episode.states.astype(np.float32)),
-            "decision_seconds": list(episode.decision_seconds),
-            "world_seconds": episode.world_seconds,
-            "simulated_seconds": episode.simulated_seconds,
-            "ending": episode.ending,
-        }
-        for trial, episode in zip(trials, episodes, strict=True)
-    ]
-    schema = _schema(episodes[0].states.shape[1], about)
-    return pa.Table.from_pylist(rows, schema=schema)
-
-
-def _from_table(table: pa.Table) -> Iterator[tuple[Trial, Episode]]:
-    ends = np.cumsum(lengths(table["states"]))
-    states_of_rows = np.split(numbers(table["states"]), ends[:-1])
-    rows = table.drop_columns("states").to_pylist()
-    for row, states in zip(rows, states_of_rows, strict=True):
-        column = Column(row["policy"], row["weights"])
-        yield (
-            Trial(column, row["level"], row["instance"], row["trial"]),
-            Episode(
-                row["outcome"],
-                row["actions"],
-                states,
-                row["decision_seconds"],
-                row["world_seconds"],
-                row["simulated_seconds"],
-                row["ending"],
-            ),
-        )
-
-
-def _read_table(path: Path) -> pa.Table:
-    try:
-        # Checksums are verified on the way.
-        file = pq.ParquetFile(path, page_checksum_verification=True)
-        if _METADATA_KEY not in (file.schema_arrow.metadata or {}):
-            raise InputError(f"{path}: its metadata know of no results.")
-        if lacking := {*_schema(1, {}).names} - {*file.schema_arrow.names}:
-            raise InputError(f"{path}: lacks the column {min(lacking)!r}.")
-        return file.read()
-    except InputError:
-        raise
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise InputError(
-            f"{path}: not a readable file of results ({error}); without it, its "
-            "episodes are run again."
-        ) from error
-
-
-def _num_rows(path: Path) -> int:
-    """How many episodes a file holds, 0 if it is not there."""
-    return _read_table(path).num_rows if path.exists() else 0
