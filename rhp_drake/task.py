@@ -24,6 +24,9 @@ BOX_SIDE: Final = 0.06  # m, section VII of the paper.
 GOAL_RADIUS: Final = 0.06  # m, section VII.
 MAX_ACTIONS: Final = 40  # Section VII.
 REWARD: Final = -1.0  # Per action, section III.
+# What a state is worth from which the goal is never reached within the limit of
+# actions; no state is worth less.
+FAILURE_VALUE: Final = REWARD * MAX_ACTIONS
 TRANSLATION: Final = 0.05  # m per action, section VII.
 ROTATION: Final = math.pi / 6  # rad per action, section VII.
 

@@ -5,13 +5,13 @@ import pytest
 
 from rhp_drake.planning.policy import PolicyError
 from rhp_drake.planning.receding_horizon import (
-    FAILURE_VALUE,
     RecedingHorizon,
     sample_softmax,
 )
 from rhp_drake.push_model.transition import PushModelError
 from rhp_drake.random_streams import stream
 from rhp_drake.task import (
+    FAILURE_VALUE,
     TABLE_UPPER,
     Action,
     allowed_actions,
@@ -114,12 +114,25 @@ def test_best_roll_out_is_executed():
     assert set(decision.returns) == {-1, -2 - 9}
 
 
-def test_losing_the_box_is_as_bad_as_never_arriving():
+def test_losing_the_box_is_worse_than_never_arriving():
     state = STATE.copy()
     state[3:5] = [0.40, TABLE_UPPER[1] - 0.02]
     leftward = Constant(-99, -99, -9, -99, -99, -99)
     decision = rhp(leftward).decide(state, goal_after(5), stream(0))
-    assert decision.value == FAILURE_VALUE
+    assert decision.value == FAILURE_VALUE - 1
+
+
+@pytest.mark.parametrize("value", [-36.0, -70.0])
+def test_the_box_is_not_lost_however_bad_the_values_are(value):
+    state = STATE.copy()
+    state[3:5] = [0.40, TABLE_UPPER[1] - 0.02]
+    undecided = Constant(*[value] * 6)
+    for seed in range(20):
+        decision = rhp(undecided, n=60, h=2).decide(state, goal_after(5), stream(seed))
+        lost = object_positions(decision.roll_outs)[:, -1, 0, 1] > TABLE_UPPER[1]
+        assert lost.any()
+        assert (decision.returns[lost] < decision.returns[~lost].min()).all()
+        assert decision.value == value - 2
 
 
 def test_masked_actions_are_never_drawn():

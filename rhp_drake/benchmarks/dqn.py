@@ -19,9 +19,8 @@ from rhp_drake.errors import InputError
 from rhp_drake.evaluation.episode import Episode, greedy_episodes
 from rhp_drake.frozen_instances import NUM_OBJECTS, load_instances
 from rhp_drake.learning.training import make_repeatable
-from rhp_drake.planning.receding_horizon import FAILURE_VALUE
 from rhp_drake.random_streams import VALIDATION
-from rhp_drake.task import REWARD
+from rhp_drake.task import FAILURE_VALUE, REWARD
 from rhp_drake.value.q_network import HIDDEN_LAYERS, PaperQNetwork, QNetwork
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ import torch
 from rhp_drake.errors import InputError
 from rhp_drake.learning.demonstration import training_task
 from rhp_drake.physics import UNCERTAINTY_LEVELS, draw_physics
-from rhp_drake.planning.receding_horizon import FAILURE_VALUE
 from rhp_drake.push_model.transition import PushModel, PushModelError
 from rhp_drake.random_streams import TRAINING, stream
 from rhp_drake.task import (
+    FAILURE_VALUE,
     NUM_ACTIONS,
     REWARD,
     TABLE_LOWER,

@@ -19,7 +19,7 @@ from rhp_drake.learning.imitation import ImitationConfig, Plans
 from rhp_drake.learning.learner import Learner
 from rhp_drake.learning.sampling import Samples, sample
 from rhp_drake.task import (
-    MAX_ACTIONS,
+    FAILURE_VALUE,
     REWARD,
     allowed_actions,
     goals_reached,
@@ -81,10 +81,9 @@ def double_q_targets(
         Shape (N,).
     """
     chosen = q_next.masked_fill(~allowed_next, -torch.inf).argmax(dim=1, keepdim=True)
-    # No return is worse than that of using up all actions: this bounds the values.
-    future = target_q_next.gather(1, chosen)[:, 0].clamp(REWARD * MAX_ACTIONS, 0)
+    future = target_q_next.gather(1, chosen)[:, 0].clamp(FAILURE_VALUE, 0)
     future = torch.where(reached, 0.0, future)
-    future = torch.where(fallen, REWARD * MAX_ACTIONS, future)
+    future = torch.where(fallen, FAILURE_VALUE, future)
     return REWARD + discount * future
 
 

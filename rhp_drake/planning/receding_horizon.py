@@ -1,24 +1,20 @@
 """RHP: the receding-horizon planner of section VI of the paper, and greedy GP."""
 
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from rhp_drake.planning.policy import Decision, check_decidable
 from rhp_drake.push_model.transition import PushModelError
 from rhp_drake.task import (
+    FAILURE_VALUE,
     HAND_ACTIONS,
-    MAX_ACTIONS,
     REWARD,
     allowed_actions,
     goals_reached,
     objects_fallen,
 )
-
-# The return of a state from which the goal cannot be reached any more: never within
-# the limit of actions.
-FAILURE_VALUE: Final = REWARD * MAX_ACTIONS
 
 
 class TransitionFunction(Protocol):
@@ -98,9 +94,10 @@ class RecedingHorizon:
 
     At every step of a roll-out an action is drawn from the soft-max of the values
     (Eq. 5).  The return of a roll-out is its rewards up to the horizon, plus the
-    largest value there (Eq. 1); a roll-out that reaches the goal ends there.  All
-    roll-outs go forward together: one query of the value function and one batch of
-    the push model a depth, in which equal (state, action) pairs are simulated once.
+    largest value there (Eq. 1); a roll-out that reaches the goal ends there.  One that
+    pushes an object off the table is chosen only if all do.  All roll-outs go forward
+    together: one query of the value function and one batch of the push model a depth,
+    in which equal (state, action) pairs are simulated once.
 
     With h = 0 this is the greedy policy, GP.  It also decides where the push model
     refuses the state.
@@ -158,6 +155,7 @@ class RecedingHorizon:
         returns = np.zeros(n)
         q = np.repeat(q, n, axis=0)
         alive = np.ones(n, dtype=bool)
+        fallen = np.zeros(n, dtype=bool)
         first_actions = np.zeros(n, dtype=int)
         for depth in range(self.horizon):
             choices = sample_softmax(q, self.temperature, generator)
@@ -170,14 +168,15 @@ class RecedingHorizon:
             )
             path.append(states)
             returns[alive] += self.discount**depth * REWARD
-            fallen = alive & objects_fallen(states)
-            returns[fallen] = FAILURE_VALUE
+            fallen |= objects_fallen(states)
             alive &= ~fallen & ~goals_reached(states, goals)
             if not alive.any():
                 break
             q = self._masked_values(states, goals)
         if alive.any():
             returns[alive] += self.discount**self.horizon * q[alive].max(axis=1)
+        # Whatever the values say: worse than any roll-out that keeps all objects.
+        returns[fallen] = returns[~fallen].min(initial=FAILURE_VALUE) + REWARD
         best = int(returns.argmax())
         return Decision(
             int(first_actions[best]),
