@@ -232,6 +232,40 @@ def test_bad_files_are_named(folder, tmp_path):
         load_dataset([path])
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("goals", np.nan, "a number of the column goals is not finite"),
+        ("search_next_states", np.inf, "of the column search_next_states is not"),
+        ("actions", 6, "the column actions has an unknown action"),
+        ("search_actions", -1, "the column search_actions has an unknown action"),
+    ],
+)
+def test_bad_numbers_are_named(column, value, message, folder, tmp_path):
+    table = pq.read_table(folder)
+    rows = table[column].to_pylist()
+    if isinstance(rows[3][0], list):
+        rows[3][0][0] = value
+    else:
+        rows[3][0] = value
+    index = table.column_names.index(column)
+    bad = pa.array(rows, table.schema.field(column).type)
+    path = tmp_path / "bad.parquet"
+    pq.write_table(table.set_column(index, table.schema.field(column), bad), path)
+    with pytest.raises(InputError, match=rf"bad\.parquet: .*{message}"):
+        load_dataset([path])
+
+
+def test_other_tasks_describe_themselves_otherwise(folder, tmp_path):
+    table = pq.read_table(folder)
+    for name, part in (("first", table[:2]), ("second", table[2:4])):
+        pq.write_table(part, tmp_path / name)
+    first, second = (describe(tmp_path / name) for name in ("first", "second"))
+    assert first["tasks"] == second["tasks"] == 2
+    assert first != second
+    assert describe(tmp_path / "first") == first
+
+
 def test_a_flipped_bit_is_found(folder, tmp_path):
     content = bytearray((folder / "tasks_0000000.parquet").read_bytes())
     path = tmp_path / "tasks_0000000.parquet"

@@ -9,9 +9,11 @@ from rhp_drake.learning.demonstrators import (
     PlanningDemonstrator,
     RecedingHorizonDemonstrator,
 )
+from rhp_drake.planning.receding_horizon import RecedingHorizon
 from rhp_drake.push_model.transition import PushModel
+from rhp_drake.random_streams import TRAINING, stream
 from rhp_drake.resources import models_path
-from rhp_drake.task import MAX_ACTIONS, goals_reached
+from rhp_drake.task import MAX_ACTIONS, allowed_actions, goals_reached
 from rhp_drake.value.q_network import PaperQNetwork
 from rhp_drake.value.weights import load_q_network
 
@@ -52,6 +54,25 @@ def test_rhp_may_keep_what_was_executed_alone():
     # It acted alike.
     np.testing.assert_array_equal(search.states[0], whole.instance.initial_state)
     assert pairs_of(search) <= pairs_of(whole.search)
+
+
+def test_epsilon_rhp_is_rhp_but_for_a_share_of_its_actions():
+    """Its draws say when it explores; else it does what RHP does."""
+    network = load_q_network(models_path() / "q_network/best.safetensors", 3)
+    acting = Acting(epsilon=0.5, num_roll_outs=2, horizon=2)
+    made = RecedingHorizonDemonstrator(11, network, acting).demonstrate(2)
+    policy = RecedingHorizon(PushModel(3), network, 2, 2, acting.temperature)
+    generator = stream(11, TRAINING, 2, "epsilon_rhp")
+    explored = 0
+    for state, action in zip(made.states, made.actions, strict=False):
+        explores = generator.random() < acting.epsilon
+        expected = policy.decide(state, made.instance.goals, generator).action
+        if explores:
+            explored += 1
+            allowed = np.flatnonzero(allowed_actions(state))
+            expected = generator.choice(allowed)
+        assert action == expected
+    assert 0 < explored < len(made.actions)
 
 
 def pairs_of(search):

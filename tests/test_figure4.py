@@ -3,6 +3,7 @@
 import csv
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -224,6 +225,24 @@ def test_bad_input(more, message, monkeypatch, capsys, tmp_path):
     assert lines[0].startswith(f"rhp: {message}")
     # Before any work, and nothing is left behind.
     assert not list(tmp_path.iterdir())
+
+
+def test_plans_that_miss_their_goals_do_not_count(few, monkeypatch, capsys, tmp_path):
+    plans = figure4.SHIPPED_PLANS
+    table = pq.read_table(plans)
+    actions = [
+        row[:1] if k == 2 else row for k, row in enumerate(table["actions"].to_pylist())
+    ]
+    field = table.schema.field("actions")
+    broken = table.set_column(
+        table.column_names.index("actions"), field, pa.array(actions, field.type)
+    )
+    write_table(plans, broken)
+    all_succeed(monkeypatch)
+    more = ("--plans", str(NUM_PLANS))
+    assert rhp(monkeypatch, *arguments(tmp_path / "out", *more)) == 2
+    assert "rhp: 5 plans were asked for; there are 4." in capsys.readouterr().err
+    assert rhp(monkeypatch, *arguments(tmp_path / "out", "--plans", "4")) == 0
 
 
 def test_demonstrations_of_ones_own(few, monkeypatch, capsys, tmp_path):

@@ -5,6 +5,7 @@ import resource
 
 import pyarrow.parquet as pq
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 
 from rhp_drake import cli
@@ -14,6 +15,7 @@ from rhp_drake.commands import training as commands
 from rhp_drake.commands.bench_reinforcement import _VARIANTS
 from rhp_drake.errors import InputError
 from rhp_drake.evaluation import validation
+from rhp_drake.frozen_instances import load_instances
 from rhp_drake.learning import training
 from rhp_drake.learning.demonstration_files import write_table
 from rhp_drake.learning.fitted_q import FittedQ, FittedQConfig
@@ -22,6 +24,7 @@ from rhp_drake.learning.learner import Learner
 from rhp_drake.learning.reinforcement import Reinforcement, Rounds
 from rhp_drake.learning.replay import SHIPPED_PLANS, rebuild
 from rhp_drake.learning.variants import VARIANTS, Variant
+from rhp_drake.random_streams import VALIDATION
 from rhp_drake.value.q_network import ARCHITECTURES, SetQNetwork
 from rhp_drake.value.weights import load_q_network, save_q_network
 
@@ -57,6 +60,15 @@ def small(monkeypatch):
 def imitate(monkeypatch, plans, out) -> int:
     options = ("--demonstrations", plans, "--out", out, "--steps", STEPS)
     return rhp(monkeypatch, "imitate", *options)
+
+
+def curves(out) -> dict[str, list[tuple[int, float]]]:
+    """What TensorBoard shows beside the weights: steps and values."""
+    events = EventAccumulator(f"{out}.logs").Reload()
+    return {
+        name: [(event.step, event.value) for event in events.Scalars(name)]
+        for name in events.Tags()["scalars"]
+    }
 
 
 def same_weights(one, other) -> bool:
@@ -101,6 +113,35 @@ def test_ctrl_c_loses_nothing(plans, monkeypatch, capsys, tmp_path):
     assert imitate(monkeypatch, plans, stopped) == 0
     assert "Goes on from step 4" in capsys.readouterr().out
     assert same_weights(straight, stopped)
+    shown = curves(straight)
+    assert [step for step, _ in shown["loss"]] == [2, 4, 6, 8]
+    assert [step for step, _ in shown["greedy success"]] == [4, 8]
+    assert curves(stopped) == shown
+
+
+def test_finished_work_is_not_done_again(plans, monkeypatch, capsys, tmp_path):
+    out = tmp_path / "weights"
+    assert imitate(monkeypatch, plans, out) == 0
+    content, shown = out.read_bytes(), curves(out)
+    assert imitate(monkeypatch, plans, out) == 0
+    assert "weights: is there already." in " ".join(capsys.readouterr().out.split())
+    options = ("--demonstrations", plans, "--out", out, "--steps", STEPS)
+    assert rhp(monkeypatch, "imitate", *options, "--seed", 1) == 2
+    assert "weights: holds weights of other work" in capsys.readouterr().err
+    assert out.read_bytes() == content
+    assert curves(out) == shown
+
+
+def test_progress_is_measured_on_validation_tasks(monkeypatch):
+    asked = []
+
+    def load(name, num_objects):
+        asked.append(name)
+        return load_instances(name, num_objects)
+
+    monkeypatch.setattr(validation, "load_instances", load)
+    assert validation.greedy_successes(SetQNetwork(3))[1] == 2
+    assert asked == [VALIDATION]
 
 
 def test_a_bad_loss_stops_training_with_a_sentence(
@@ -114,7 +155,8 @@ def test_a_bad_loss_stops_training_with_a_sentence(
         lambda self: whole_loss(self) * (torch.nan if self.num_steps == 3 else 1),
     )
     assert imitate(monkeypatch, plans, out) == 1
-    assert "rhp: the loss of step 3 is nan." in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "rhp: the loss of step 3 is nan.  The last checkpoint is " in error
     assert not out.exists()
     assert (tmp_path / "weights.checkpoint").exists()
 

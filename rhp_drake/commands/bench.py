@@ -10,6 +10,7 @@ from rhp_drake.commands.bench_hardware import faults, loopback
 from rhp_drake.commands.bench_planners import planners
 from rhp_drake.commands.bench_push_model import push_model
 from rhp_drake.commands.bench_reinforcement import reinforcement
+from rhp_drake.commands.options import Seed
 
 # Drake is imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ bench.command()(faults)
 def model_gap(
     *,
     pushes: Annotated[int, typer.Option(min=1, help="How many.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Of the pushes.")] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Compares single pushes in the planar push model and in the robot's station.
 

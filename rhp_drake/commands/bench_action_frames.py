@@ -4,13 +4,13 @@ from typing import Annotated
 
 import typer
 
-from rhp_drake.commands.options import NumWorkers
+from rhp_drake.commands.options import NumWorkers, Seed
 
 
 def action_frames(
     *,
     instances: Annotated[int, typer.Option(min=1, max=500, help="Tasks.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Of the searches.")] = 0,
+    seed: Seed = 0,
     workers: NumWorkers = 2,
 ) -> None:
     """Compares how well the kinodynamic RRT plans with either set of actions."""

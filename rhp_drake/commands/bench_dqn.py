@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rhp_drake.commands.options import Seed
+
 # torch and Drake are imported in the function, so that `rhp --help` is quick.
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,7 +24,7 @@ def dqn(
     steps: Annotated[
         int, typer.Option(min=1, help="Actions in the environment.")
     ] = 100_000,
-    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Trains Stable-Baselines3's DQN from scratch, on the Gymnasium environment.
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rhp_drake.commands.options import Seed
+
 # Drake is imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -126,7 +128,7 @@ def faults(
     *,
     out: Annotated[Path, typer.Option(help="Folder of the results.")],
     count: Annotated[int, typer.Option(min=1, help="Injections, of all kinds.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Lets things go wrong at random moments, over loopback, in real time.
 

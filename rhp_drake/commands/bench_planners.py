@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rhp_drake.commands.options import NumWorkers
+from rhp_drake.commands.options import NumWorkers, Seed
 
 # Drake is imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def planners(
     time_limit: Annotated[
         float, typer.Option(min=1, help="Of computation for each search, s.")
     ] = 60.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the searches.")] = 0,
+    seed: Seed = 0,
     workers: NumWorkers = 2,
 ) -> None:
     """Compares our planners with OMPL's RRT and SST on the same push model.

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rhp_drake.commands.options import Seed
 from rhp_drake.planning.policy_config import DEFAULT_Q_NETWORK
 
 # Drake is imported in the functions, so that `rhp --help` is quick.
@@ -31,7 +32,7 @@ def push_model(
     weights: Annotated[
         str, typer.Option(help="File of the Q-network's weights.")
     ] = DEFAULT_Q_NETWORK,
-    seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
+    seed: Seed = 0,
     workers: Annotated[
         int, typer.Option(min=1, help="Processes of the closed loop.")
     ] = 2,

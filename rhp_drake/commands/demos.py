@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rhp_drake.commands.options import NumWorkers, RayAddress
+from rhp_drake.commands.options import NumWorkers, RayAddress, Seed
 from rhp_drake.errors import InputError
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
@@ -53,7 +53,7 @@ def make(
     first_task: Annotated[
         int, typer.Option(min=0, help="The number of the first task.")
     ] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    seed: Seed = 0,
     objects: Annotated[
         int, typer.Option(min=1, max=10, help="How many boxes the tasks have.")
     ] = 3,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rhp_drake.commands.options import NumWorkers, RayAddress
+from rhp_drake.commands.options import NumWorkers, RayAddress, Seed
 from rhp_drake.errors import InputError
 from rhp_drake.physics import UNCERTAINTY_LEVELS
 from rhp_drake.planning.policy_config import POLICIES
@@ -86,7 +86,7 @@ def evaluate(
     temperature: Annotated[
         float | None, typer.Option(help="tau of RHP's soft-max, in actions.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the random draws.")] = 0,
+    seed: Seed = 0,
     workers: NumWorkers = 2,
     ray: RayAddress = None,
     out: Annotated[

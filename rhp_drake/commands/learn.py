@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rhp_drake.commands.options import Seed
 from rhp_drake.commands.training import train_and_save
 from rhp_drake.errors import InputError
 from rhp_drake.files import check_writable
@@ -21,7 +22,6 @@ _Demos = Annotated[
 ]
 _Out = Annotated[Path, typer.Option(help="File of the trained weights.")]
 _Start = Annotated[Path, typer.Option(help="Weights to start from.")]
-_Seed = Annotated[int, typer.Option(min=0, help="Of all random draws.")]
 _Steps = Annotated[int, typer.Option(min=1, help="Gradient steps.")]
 
 
@@ -29,7 +29,7 @@ def imitate(
     *,
     demonstrations: _Demos,
     out: _Out,
-    seed: _Seed = 0,
+    seed: Seed = 0,
     steps: _Steps = 40_000,
     network: Annotated[
         str, typer.Option(help="set, or paper: the layers of the paper.")
@@ -67,7 +67,7 @@ def reinforce(
     demonstrations: _Demos,
     start: _Start,
     out: _Out,
-    seed: _Seed = 0,
+    seed: Seed = 0,
     steps: _Steps = 40_000,
     variant: Annotated[
         str, typer.Option(help="best, or paper: as the paper does it.")
@@ -124,7 +124,6 @@ def reinforce(
     )
     origin = _origin(seed, start, network) | {"rounds": asdict(chosen.rounds)}
     train_and_save(learner, out, demonstrations, origin, Console(), reinforcement)
-    reinforcement.forget()
 
 
 def _origin(seed: int, start: Path, network: "QNetwork") -> dict[str, Any]:

@@ -1,13 +1,14 @@
 """What the commands that train a Q-network share: progress, logs, the weights' file."""
 
 from dataclasses import asdict
+import json
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
-from rhp_drake.errors import WorkError
+from rhp_drake.errors import InputError, WorkError
 
 # torch and Drake are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ def train_and_save(
     """Trains to the end, from a checkpoint if there is one, and writes the weights.
 
     Progress is shown, and logged for TensorBoard in a folder beside the weights.  So is
-    the greedy policy's success on validation tasks, every now and then.
+    the greedy policy's success on validation tasks, every now and then.  If the weights
+    are there, it says so.
 
     Args:
         learner: Trains the network.
@@ -39,14 +41,14 @@ def train_and_save(
         sources: Where the data come from.
         origin: What else the result depends on, for checkpoint and provenance.
         console: Where to say things.
-        reinforcement: Makes experience on the way.
+        reinforcement: Makes experience on the way, which is removed at the end.
 
     Raises:
         typer.Exit: With status 130 after Ctrl-C.
+        InputError: If the weights' file is there and holds something else.
         WorkError: If the loss is not finite, a worker dies, or nothing can be written;
             the last checkpoint stays.
     """
-    from rhp_drake.evaluation.validation import greedy_successes
     from rhp_drake.learning.demonstration_folder import describe
     from rhp_drake.run_record import source_commit
     from rhp_drake.value.weights import save_q_network
@@ -55,8 +57,14 @@ def train_and_save(
     commit = source_commit()
     origin |= {"demonstrations": [describe(path) for path in sources]}
     checkpoint = out.with_name(out.name + ".checkpoint")
+    if out.exists() and not checkpoint.exists():
+        _check_done(out, learner, origin)
+        console.print(f"{out}: is there already.")
+        return
     try:
-        _train(learner, out, checkpoint, origin, console, reinforcement)
+        successes, trials = _train(
+            learner, out, checkpoint, origin, console, reinforcement
+        )
     except KeyboardInterrupt:
         console.print("Stopped; the same command goes on from its last checkpoint.")
         raise typer.Exit(130) from None
@@ -65,8 +73,11 @@ def train_and_save(
         raise WorkError(
             f"{error.filename or out}: cannot be written: {error.strerror}."
         ) from error
+    except WorkError as error:
+        if not checkpoint.exists():
+            raise
+        raise WorkError(f"{error}  The last checkpoint is {checkpoint}.") from error
     network = learner.network
-    successes, trials = greedy_successes(network)
     network.provenance = {
         "command": " ".join(["rhp", *sys.argv[1:]]),
         "commit": commit,
@@ -76,11 +87,26 @@ def train_and_save(
         "loss": learner.mean_loss,
     }
     save_q_network(network, out)
+    if reinforcement is not None:
+        reinforcement.forget()
+    # Last, because without it the work would be taken for done.
     checkpoint.unlink(missing_ok=True)
     console.print(
         f"{out}: {out.stat().st_size / 1e3:.0f} kB, greedily solves {successes} of "
         f"{trials} validation tasks."
     )
+
+
+def _check_done(out: Path, learner: "Learner", origin: dict[str, Any]) -> None:
+    """Raises an InputError if the file is not what this training makes."""
+    from rhp_drake.value.weights import load_q_network
+
+    noted = load_q_network(out, learner.network.num_objects).provenance
+    made = {**origin, **asdict(learner.config)}  # type: ignore[call-overload]
+    # As JSON, in which the file has it.
+    wanted = json.loads(json.dumps(made))
+    if {name: noted.get(name) for name in wanted} != wanted:
+        raise InputError(f"{out}: holds weights of other work; choose another file.")
 
 
 def _train(
@@ -90,7 +116,8 @@ def _train(
     origin: dict[str, Any],
     console: "Console",
     reinforcement: "Reinforcement | None",
-) -> None:
+) -> tuple[int, int]:
+    """Trains; returns how many validation tasks are solved greedily, of how many."""
     from torch.utils.tensorboard import SummaryWriter
 
     from rhp_drake.commands.progress import make_progress
@@ -101,7 +128,8 @@ def _train(
     total = learner.config.num_steps
     logs = out.with_name(out.name + ".logs")
     with (
-        SummaryWriter(str(logs), purge_step=learner.num_steps) as writer,
+        # What a stopped training logged after its checkpoint comes again.
+        SummaryWriter(str(logs), purge_step=learner.num_steps + 1) as writer,
         make_progress(console) as progress,
     ):
         if learner.num_steps:
@@ -123,3 +151,6 @@ def _train(
             if step % _VALIDATION_PERIOD == 0 and step < total:
                 successes, trials = greedy_successes(learner.network)
                 writer.add_scalar("greedy success", successes / trials, step)
+        successes, trials = greedy_successes(learner.network)
+        writer.add_scalar("greedy success", successes / trials, total)
+    return successes, trials

@@ -82,8 +82,11 @@ class Figure4:
         with exclusive(self.folder):
             settings = json.dumps(self.settings(), indent=1)
             write_atomically(self.folder / _SETTINGS, settings + "\n")
-            if not self.demonstrations and not (self.folder / _PLANS).exists():
-                rebuild(SHIPPED_PLANS, self.folder / _PLANS)
+            if not self.demonstrations:
+                if not (self.folder / _PLANS).exists():
+                    rebuild(SHIPPED_PLANS, self.folder / _PLANS)
+                # Some may not have reached their goals again.
+                self._check_plans(max(point.num_plans for point in points))
             missing = []
             for point in points:
                 if self.weights_path(point).exists():
@@ -122,7 +125,9 @@ class Figure4:
                     f"tasks to evaluate on of {NUM_OBJECTS}."
                 )
         else:
-            available = read_table(SHIPPED_PLANS, ["task"]).num_rows
+            rebuilt = self.folder / _PLANS
+            plans = rebuilt if rebuilt.exists() else SHIPPED_PLANS
+            available = read_table(plans, ["task"]).num_rows
         if num_plans > available:
             raise InputError(
                 f"{num_plans} plans were asked for; there are {available}."

@@ -11,6 +11,7 @@ import pyarrow as pa
 from rhp_drake.errors import InputError
 from rhp_drake.learning.demonstration_files import lengths, numbers, read_table
 from rhp_drake.learning.demonstration_folder import shard_paths
+from rhp_drake.task import NUM_ACTIONS
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ def load_dataset(paths: Sequence[Path]) -> Dataset:
 
 
 def _flatten(path: Path, table: pa.Table) -> Dataset:
+    _check_values(path, table)
     goals = numbers(table["goals"])
     if (lengths(table["states"]) != lengths(table["actions"]) + 1).any():
         raise InputError(f"{path}: a plan's states are not one more than its actions.")
@@ -108,6 +110,17 @@ def _flatten(path: Path, table: pa.Table) -> Dataset:
         search_origins=origins,
         solved=table["solved"].to_numpy(),
     )
+
+
+def _check_values(path: Path, table: pa.Table) -> None:
+    """Raises an InputError if a number cannot be learned from."""
+    for name in ("initial_state", "goals", "states", "search_next_states"):
+        if not np.isfinite(numbers(table[name])).all():
+            raise InputError(f"{path}: a number of the column {name} is not finite.")
+    for name in ("actions", "search_actions"):
+        actions = numbers(table[name])
+        if ((actions < 0) | (actions >= NUM_ACTIONS)).any():
+            raise InputError(f"{path}: the column {name} has an unknown action.")
 
 
 def without_oldest(data: Dataset, num_transitions: int) -> Dataset:

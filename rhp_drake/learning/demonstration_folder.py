@@ -9,6 +9,7 @@ number alone, the folder comes out the same, `seconds` aside, whoever worked on 
 from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import partial
+from hashlib import sha256
 import logging
 from pathlib import Path
 import time
@@ -24,8 +25,11 @@ from rhp_drake.learning.demonstration import (
     training_task,
 )
 from rhp_drake.learning.demonstration_files import (
+    COMPACT_COLUMNS,
     about,
     join_tables,
+    lengths,
+    numbers,
     read_table,
     to_table,
     write_table,
@@ -177,9 +181,18 @@ def shard_paths(paths: Sequence[Path]) -> list[Path]:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What a file or the first one of a folder says of itself, and how many "tasks".
+    """What a file or the first one of a folder says of itself, and which tasks it has.
 
-    See `demonstration_files.about`.
+    Returns:
+        See `demonstration_files.about`; "tasks", how many, and "sha256" of tasks and
+        plans.
     """
-    tables = [read_table(shard, ["task"]) for shard in shard_paths([path])]
-    return about(tables[0]) | {"tasks": sum(table.num_rows for table in tables)}
+    tables = [read_table(shard, COMPACT_COLUMNS) for shard in shard_paths([path])]
+    digest = sha256()
+    for table in tables:
+        for name in ("seed", "task"):
+            digest.update(table[name].to_numpy().tobytes())
+        digest.update(lengths(table["actions"]).tobytes())
+        digest.update(numbers(table["actions"]).tobytes())
+    tasks = sum(table.num_rows for table in tables)
+    return about(tables[0]) | {"tasks": tasks, "sha256": digest.hexdigest()}

@@ -78,13 +78,17 @@ class Learner(ABC):
         """One gradient step on a random batch.
 
         Raises:
-            WorkError: If the loss is not finite; the network is as before the step.
+            WorkError: If loss or gradient is not finite; the network is as before.
         """
         loss = self._loss()
         if not torch.isfinite(loss):
             raise WorkError(f"the loss of step {self.num_steps} is {loss.item()}.")
         self._optimizer.zero_grad()
         loss.backward()
+        # The gradient of a finite loss may overflow.
+        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
+        if not all(gradient.isfinite().all() for gradient in gradients):
+            raise WorkError(f"the gradient of step {self.num_steps} is not finite.")
         self._optimizer.step()
         self._schedule.step()
         self.num_steps += 1

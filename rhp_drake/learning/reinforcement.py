@@ -113,7 +113,7 @@ class Reinforcement:
 
     def forget(self) -> None:
         """Removes the experience, once nothing is to be learned from it any more."""
-        shutil.rmtree(self._folder)
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def _read(self, num_rounds: int) -> bool:
         """Reads the experience of the first so many rounds; whether any was new."""
