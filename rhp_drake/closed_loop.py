@@ -12,7 +12,6 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import ConstantVectorSource
 
-from rhp_drake.errors import InputError
 from rhp_drake.planning.policy import Policy
 from rhp_drake.scenario import Scenario
 from rhp_drake.station.hardware_station import Arm, MakeHardwareStation, Tracker
@@ -57,16 +56,11 @@ def MakeStation(
     Raises:
         InputError: If there is no such station.
     """
-    try:
-        if hardware is None:
-            return MakeSimulatedStation(scenario.station, meshcat)
-        return MakeHardwareStation(
-            scenario.station, hardware.arm, hardware.tracker, meshcat
-        )
-    except (RuntimeError, ValueError, SystemExit) as error:
-        # Words of Drake's about models and settings that come from the scenario.  A
-        # failed assertion in Drake comes as a SystemExit.
-        raise InputError(f"station: {error}") from error
+    if hardware is None:
+        return MakeSimulatedStation(scenario.station, meshcat)
+    return MakeHardwareStation(
+        scenario.station, hardware.arm, hardware.tracker, meshcat
+    )
 
 
 @dataclass(frozen=True)
@@ -136,21 +130,25 @@ def AddRobot(
     )
 
 
-def MakeClosedLoop(
+def AddClosedLoop(
+    builder: DiagramBuilder,
     scenario: Scenario,
     policy: Policy,
     meshcat: "Meshcat | None" = None,
     hardware: Hardware | None = None,
-) -> Diagram:
-    """Builds the diagram: station -> estimator -> planner -> servo -> guard -> station.
+) -> None:
+    """Adds the loop: station -> estimator -> planner -> servo -> guard -> station.
 
-    The diagram knows no task: `run_closed_loop` puts it into the context, so that one
-    diagram serves any number of tasks.
+    `builder.GetSubsystemByName` finds the systems: `station`, `state_estimator`,
+    `planner`, `hand_servo`, `command_guard`, `goals`, and `overlay` where there is a
+    meshcat.  Whatever else is in the builder may use their ports.
 
-    The diagram has these output ports, each named as in the system it comes from:
-    `state`, `goals`, `decision`, `status`, `message`, `fault`.
+    The loop knows no task: `run_closed_loop` puts it into the context, so that one
+    diagram serves any number of tasks.  Until then its goals are nan, and the planner
+    refuses to plan.
 
     Args:
+        builder: Gets the systems.
         scenario: Says which station.
         policy: Who decides.
         meshcat: Where to show it; None to show nothing, which changes nothing else.
@@ -160,9 +158,9 @@ def MakeClosedLoop(
         InputError: If there is no such station.
     """
     m = len(scenario.station.objects)
-    builder = DiagramBuilder()
     robot = AddRobot(builder, scenario, meshcat, hardware)
-    goals = builder.AddNamedSystem("goals", ConstantVectorSource(np.zeros(2 * m)))
+    unknown = np.full(2 * m, np.nan)
+    goals = builder.AddNamedSystem("goals", ConstantVectorSource(unknown))
     planner = builder.AddNamedSystem("planner", RecedingHorizonPlanner(policy, m))
     builder.Connect(robot.state, planner.GetInputPort("state"))
     builder.Connect(robot.at_rest, planner.GetInputPort("at_rest"))
@@ -181,11 +179,16 @@ def MakeClosedLoop(
         )
         builder.Connect(robot.fault, overlay.GetInputPort("fault"))
 
-    builder.ExportOutput(robot.state, "state")
-    builder.ExportOutput(goals.get_output_port(), "goals")
-    for name in ("decision", "status", "message"):
-        builder.ExportOutput(planner.GetOutputPort(name), name)
-    builder.ExportOutput(robot.fault, "fault")
+
+def MakeClosedLoop(
+    scenario: Scenario,
+    policy: Policy,
+    meshcat: "Meshcat | None" = None,
+    hardware: Hardware | None = None,
+) -> Diagram:
+    """Makes a diagram of nothing but the loop; see `AddClosedLoop`."""
+    builder = DiagramBuilder()
+    AddClosedLoop(builder, scenario, policy, meshcat, hardware)
     diagram = builder.Build()
     diagram.set_name("closed_loop")
     return diagram

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 import time
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -52,6 +52,13 @@ class Outcome:
         return self.status == SUCCEEDED
 
 
+def output_of(simulator: Simulator, system: str, port: str) -> Any:
+    """What is at an output port of one of the loop's systems now."""
+    dut = simulator.get_system().GetSubsystemByName(system)
+    context = dut.GetMyContextFromRoot(simulator.get_context())
+    return dut.GetOutputPort(port).Eval(context)
+
+
 def run_closed_loop(
     simulator: Simulator,
     instance: task.TaskInstance,
@@ -66,7 +73,7 @@ def run_closed_loop(
     The same arguments give the same run, whatever ran in the simulator before.
 
     Args:
-        simulator: Of a diagram that `MakeClosedLoop` made.
+        simulator: Of a diagram with what `AddClosedLoop` added.
         instance: The task.
         physics: Of the objects in the world.
         seed: Of the policy's random draws.
@@ -99,7 +106,7 @@ def run_on_hardware(
     caught up with.
 
     Args:
-        simulator: Of a diagram that `MakeClosedLoop` made with `hardware`.
+        simulator: Of a diagram with what `AddClosedLoop` added for `hardware`.
         goal: Centre of the target's goal region, shape (2,), m in W.
         seed: Of the policy's random draws.
         time_limit: When to give up, s, thinking aside.
@@ -120,20 +127,22 @@ def run_on_hardware(
     # Where they are not finite, initialization says so.
     if np.isfinite(measured).all():
         diagram.GetSubsystemByName("hand_servo").check_start(measured)
-    state = diagram.GetOutputPort("state").Eval(context)
+    state = output_of(simulator, "state_estimator", "state")
     goals = task.object_positions(state).copy()
     goals[0] = goal
     _set_goals(simulator, goals)
     # What begins at the task's beginning, such as the overlay's discs, needs the goals.
     simulator.Initialize()
 
-    fault = diagram.GetOutputPort("fault")
     ticks = 0
+
+    def fault() -> Fault:
+        return Fault(int(output_of(simulator, "command_guard", "fault")[0]))
 
     def advance(until: float) -> None:
         nonlocal ticks
         # After a fault at once: who called ends the drivers, which brake.
-        while context.get_time() < until and fault.Eval(context)[0] == Fault.NONE:
+        while context.get_time() < until and fault() == Fault.NONE:
             begin = time.monotonic()
             # Half-way between two commands, so that each stretch has exactly one: the
             # planner's period is no multiple of theirs.
@@ -159,36 +168,31 @@ def _run(
         time_limit: See `run_closed_loop`.
         on_decision: Likewise.
     """
-    diagram, context = simulator.get_system(), simulator.get_context()
-    status = diagram.GetOutputPort("status")
-    decision = diagram.GetOutputPort("decision")
-    fault = diagram.GetOutputPort("fault")
-
+    context = simulator.get_context()
     num_actions = 0
     ticks = 0
     end, message = "", ""
     while not end:
         ticks += 1
         advance(ticks * PLANNER_PERIOD)
-        record = decision.Eval(context)
+        record = output_of(simulator, "planner", "decision")
         if record.index == num_actions:
             num_actions += 1
             on_decision(record)
-        planner_status = Status(int(status.Eval(context)[0]))
-        guard_fault = Fault(int(fault.Eval(context)[0]))
+        planner_status = Status(int(output_of(simulator, "planner", "status")[0]))
+        guard_fault = Fault(int(output_of(simulator, "command_guard", "fault")[0]))
         if guard_fault != Fault.NONE:
             end = GUARD_FAULT
             message = f"the arm was stopped: {describe(guard_fault)}"
         elif planner_status != Status.RUNNING:
             end = planner_status.name.lower()
-            message = diagram.GetOutputPort("message").Eval(context)
+            message = output_of(simulator, "planner", "message")
         elif context.get_time() >= time_limit:
             end = TIME_LIMIT
             message = f"not done after {time_limit:g} s in the world."
 
-    state = diagram.GetOutputPort("state").Eval(context)
-    target_goal = diagram.GetOutputPort("goals").Eval(context)[:2]
-    offset = task.object_positions(state)[0] - target_goal
+    state = output_of(simulator, "state_estimator", "state")
+    offset = task.object_positions(state)[0] - output_of(simulator, "goals", "y0")[:2]
     return Outcome(
         status=end,
         message=message,

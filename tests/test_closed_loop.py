@@ -3,15 +3,18 @@ import json
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput
 import pytest
 
 from rhp_drake import cli, task
-from rhp_drake.closed_loop import MakeClosedLoop
+from rhp_drake.closed_loop import AddClosedLoop, MakeClosedLoop
 from rhp_drake.physics import draw_physics, nominal_physics
 from rhp_drake.planning.policy import Decision
 from rhp_drake.random_streams import stream
-from rhp_drake.run_closed_loop import run_closed_loop
+from rhp_drake.run_closed_loop import output_of, run_closed_loop
 from rhp_drake.scenario import Scenario, load_scenario, make_task_instance
+from rhp_drake.systems.receding_horizon_planner import Status
 
 POLICY = "rhp_drake.planning.policy_config.MakePolicy"
 
@@ -85,14 +88,36 @@ def test_pushes_target_home():
     assert outcome.succeeded
     assert 2 <= outcome.num_actions <= 5
     assert outcome.target_distance <= task.GOAL_RADIUS
-    context = simulator.get_context()
-    final = simulator.get_system().GetOutputPort("state").Eval(context)
+    final = output_of(simulator, "state_estimator", "state")
     assert task.goals_reached(final, goals)
     # The far border of the workspace stops a hand that finds nothing to push.
     far = task.TaskInstance(np.r_[0.75, 0.29, state[2:]], goals)
     outcome = run_closed_loop(simulator, far, nominal_physics(3), seed=0)
     assert outcome.status == "policy_failed"
     assert "FORWARD" in outcome.message
+
+
+def test_the_loop_is_part_of_another_diagram():
+    """What README shows: the loop in one's own builder, with a logger."""
+    builder = DiagramBuilder()
+    AddClosedLoop(builder, Scenario(), RandomPolicy())
+    guard = builder.GetSubsystemByName("command_guard")
+    logger = LogVectorOutput(guard.GetOutputPort("position"), builder)
+    simulator = Simulator(builder.Build())
+    outcome, decisions = run(simulator, index=1, seed=5)
+    alone = Simulator(MakeClosedLoop(Scenario(), RandomPolicy()))
+    assert run(alone, index=1, seed=5) == (outcome, decisions)
+    log = logger.FindLog(simulator.get_context())
+    assert log.data().shape[0] == 6
+    assert np.ptp(log.data(), axis=1).max() > 0.01
+
+
+def test_a_loop_without_a_task_stands_still():
+    simulator = Simulator(MakeClosedLoop(Scenario(), Forward()))
+    simulator.AdvanceTo(0.5)
+    assert output_of(simulator, "planner", "status")[0] == Status.POLICY_FAILED
+    assert "are not finite" in output_of(simulator, "planner", "message")
+    assert output_of(simulator, "planner", "decision").index == -1
 
 
 def test_guard_fault_ends_run():

@@ -14,7 +14,7 @@ from rhp_drake.closed_loop import Hardware, MakeClosedLoop, MakeStation
 from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.errors import InputError
 from rhp_drake.planning.policy import Decision
-from rhp_drake.run_closed_loop import run_on_hardware
+from rhp_drake.run_closed_loop import output_of, run_on_hardware
 from rhp_drake.safety import Fault
 from rhp_drake.scenario import Scenario
 from rhp_drake.station.hardware_station import MeasureStation
@@ -140,7 +140,7 @@ def test_the_loop_moves_the_arm_and_takes_its_goals_from_what_it_sees(
     assert outcome.num_actions == 1
     expected = hand_targets(HAND, np.array(Action.FORWARD))
     np.testing.assert_allclose(hand_pose(hardware.arm.position), expected, atol=1e-3)
-    goals = simulator.get_system().GetOutputPort("goals").Eval(simulator.get_context())
+    goals = output_of(simulator, "goals", "y0")
     np.testing.assert_allclose(goals, [0.7, 0.25, *BOXES[1:, :2].ravel()])
     steps = np.diff(hardware.arm.commands, axis=0)
     assert np.abs(steps).max() / COMMAND_PERIOD < 1.0

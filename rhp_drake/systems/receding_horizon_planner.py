@@ -128,7 +128,7 @@ class RecedingHorizonPlanner(LeafSystem):
     scene may change while the policy thinks, and then the policy decides anew.
 
     The episode ends when all objects are at their goals, after `MAX_ACTIONS` actions,
-    when an object has fallen, when the policy fails or the state is not finite, or
+    when an object has fallen, when the policy fails, state or goals are not finite, or
     when an action is not done after `PATIENCE`.  Then the hand's target stays where it
     is.
 
@@ -253,6 +253,10 @@ class RecedingHorizonPlanner(LeafSystem):
         if not np.isfinite(state).all():
             return episode.ended(
                 Status.POLICY_FAILED, f"the measured state {state} is not finite."
+            )
+        if not np.isfinite(goals).all():
+            return episode.ended(
+                Status.POLICY_FAILED, f"the goals {goals.tolist()} are not finite."
             )
         if objects_fallen(state):
             return episode.ended(Status.OBJECT_FELL, "an object fell off the table.")
