@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 import math
 import re
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias, assert_never
 
 from rhp_drake.errors import InputError
 from rhp_drake.planning.policy import Policy
@@ -258,6 +258,8 @@ def MakePolicy(
         return PredictiveSampling(push_model, config.num_roll_outs, config.horizon)
     if isinstance(config, MppiConfig):
         return Mppi(push_model, config.num_roll_outs, config.horizon)
+    if not isinstance(config, GreedyConfig | RecedingHorizonConfig):
+        assert_never(config)
     q_network = load_q_network(resolve(config.q_network), num_objects)
     if isinstance(config, GreedyConfig):
         policy = RecedingHorizon(push_model, q_network, 0, 0, 1.0)
