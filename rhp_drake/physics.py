@@ -170,24 +170,28 @@ def set_object_physics(
     plant_context: "Context",
     scene_graph: "SceneGraph",
     scene_graph_context: "Context",
-) -> None:
-    """Writes the physics of boxes into the contexts of a plant and its scene graph.
+) -> list[float]:
+    """Writes the physics of objects into the contexts of a plant and its scene graph.
 
     Shapes (of every role) keep their height; masses are those of the model times area
     and density over the nominal ones; inertias are those of solid boxes.  The result is
     that of a plant built with these values.
 
     Args:
-        physics: The physics of m boxes.
+        physics: The physics of m objects.
         objects: Names of their m model instances, each of one body with one collision
-            box.
+            shape, a box or a cylinder, around its origin.
         plant: The finalized plant; `plant_context` is its context.
         plant_context: Changed.
         scene_graph: The plant's scene graph; `scene_graph_context` is its context.
         scene_graph_context: Changed.
 
+    Returns:
+        The objects' heights, m.
+
     Raises:
-        InputError: If there are not as many objects as in `physics`.
+        InputError: If there are not as many objects as in `physics`, or one has another
+            shape.
     """
     from pydrake.geometry import Box, Cylinder, ProximityProperties, Role, RoleAssign
     from pydrake.multibody.plant import CoulombFriction
@@ -205,6 +209,7 @@ def set_object_physics(
     )
     source = plant.get_source_id()
     nominal_area_density = BOX_SIDE**2 * NOMINAL_DENSITY
+    heights = []
     for i, name in enumerate(objects):
         (index,) = plant.GetBodyIndices(plant.GetModelInstanceByName(name))
         body = plant.get_body(index)
@@ -213,7 +218,10 @@ def set_object_physics(
         round_one = physics.shapes[i] == CYLINDER
         (collision, *_) = inspector.GetGeometries(frame, Role.kProximity)
         shape = inspector.GetShape(collision)
+        if not isinstance(shape, Box | Cylinder):
+            raise InputError(f"the object '{name}' must be a box or a cylinder.")
         height = shape.length() if isinstance(shape, Cylinder) else shape.height()
+        heights.append(height)
         new_shape = Cylinder(x / 2, height) if round_one else Box(x, y, height)
         for role in (Role.kProximity, Role.kIllustration, Role.kPerception):
             for geometry in inspector.GetGeometries(frame, role):
@@ -240,6 +248,7 @@ def set_object_physics(
             if round_one
             else SpatialInertia.SolidBoxWithMass(mass, x, y, height),
         )
+    return heights
 
 
 def _draw_factors(

@@ -20,7 +20,7 @@ from rhp_drake.physics import UNCERTAINTY_LEVELS
 from rhp_drake.planning.policy_config import PolicyConfig, RecedingHorizonConfig
 from rhp_drake.random_streams import TRAINING, VALIDATION, stream
 from rhp_drake.resources import scenarios_path
-from rhp_drake.station.station_models import StationConfig
+from rhp_drake.station.station_models import StationConfig, resolve_directives
 from rhp_drake.systems.command_guard import CommandGuardConfig
 from rhp_drake.visualization import VisualizationConfig
 
@@ -121,6 +121,7 @@ def load_scenario(
         where_text = f"{where}, overridden by {text!r}"
         node = typed_yaml.read_document(text, where_text)
         scenario = typed_yaml.merge(node, scenario, where_text)
+    resolve_directives(scenario.station, _find(Path(path)).resolve().parent)
     try:
         check_scenario(scenario)
     except InputError as error:
@@ -183,11 +184,7 @@ def check_scenario(scenario: Scenario) -> None:
     _check(scenario.seed >= 0, "seed", scenario.seed, "at least 0")
     good = 0 < scenario.time_limit < math.inf
     _check(good, "time_limit", scenario.time_limit, "positive and finite")
-    objects = scenario.station.objects
-    distinct = len(set(objects)) == len(objects)
-    _check(distinct, "station.objects", objects, "names of different objects")
-    time_step = scenario.station.plant.time_step
-    _check(time_step > 0, "station.plant.time_step", time_step, "positive")
+    scenario.station.validate()
     levels = ", ".join(UNCERTAINTY_LEVELS)
     known = scenario.world_physics in UNCERTAINTY_LEVELS
     _check(known, "world_physics", scenario.world_physics, f"one of {levels}")

@@ -148,6 +148,17 @@ def test_expanded_scenario_loads_again(tmp_path):
         ("a: {policy: {horizon: x}}", ": a: policy.horizon: 'x' is not a value it ca"),
         ("a: {seed: -1}", ": a: seed: must be at least 0, not -1."),
         ("a: {station: {plant: {time_step: 0}}}", ": a: station.plant.time_step: must"),
+        ("a: {station: {plant: {time_step: 0.1}}}", ": a: station.plant.time_step: mu"),
+        ("a: {station: {objects: []}}", ": a: station.objects: must be names of diff"),
+        ("a: {station: {objects: [b, b]}}", ": a: station.objects: must be names of "),
+        (
+            "a: {station: {position_gains: [1, 2]}}",
+            ": a: station.position_gains: must be 6 finite numbers, none of them neg",
+        ),
+        (
+            "a: {station: {velocity_gains: [1, 2, 3, 4, 5, -1]}}",
+            ": a: station.velocity_gains: must be 6 finite numbers, none of them neg",
+        ),
         (
             "a: {time_limit: 0}",
             ": a: time_limit: must be positive and finite, not 0.0.",

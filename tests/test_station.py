@@ -15,6 +15,8 @@ from rhp_drake.physics import (
     nominal_physics,
 )
 from rhp_drake.random_streams import stream
+from rhp_drake.resources import models_path
+from rhp_drake.scenario import load_scenario
 from rhp_drake.station.ports import COMMAND_PERIOD, declared_ports, station_ports
 from rhp_drake.station.simulated_station import (
     MakeSimulatedStation,
@@ -196,7 +198,7 @@ def test_colours_tell_roles():
 
 def test_config_is_yaml():
     text = """
-    objects: [target]
+    objects: [obstacle_1, target, obstacle_2]
     plant: {time_step: 0.002, contact_model: point}
     """
     config = yaml_load_typed(schema=StationConfig, data=text, defaults=StationConfig())
@@ -211,6 +213,51 @@ def test_config_is_yaml():
     assert station.plant().get_contact_model() == ContactModel.kPoint
 
 
+def write_station(folder, shape: str) -> str:
+    """Beside one another: a scenario, its directives, and an object of that shape."""
+    box = (models_path() / "box/box.sdf").read_text()
+    text = box.replace("<box><size>0.06 0.06 0.06</size></box>", shape)
+    (folder / "object.sdf").write_text(text)
+    (folder / "mine.yaml").write_text(
+        """
+        mine:
+          station:
+            directives:
+            - add_directives: {file: package://rhp_drake/station.dmd.yaml}
+            - add_model: {name: target, file: object.sdf}
+            objects: [target]
+        """
+    )
+    return str(folder / "mine.yaml")
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "<box><size>0.06 0.06 0.12</size></box>",
+        "<cylinder><radius>0.03</radius><length>0.12</length></cylinder>",
+    ],
+    ids=["box", "cylinder"],
+)
+def test_an_object_of_ones_own_stands_on_the_table(shape, tmp_path):
+    """Its file is named relative to the scenario's; its height is its own."""
+    _, scenario = load_scenario(write_station(tmp_path, shape))
+    station = MakeSimulatedStation(scenario.station)
+    simulator = start(station, STATE[:6], nominal_physics(1))
+    for time in (0.0, 0.5):
+        simulator.AdvanceTo(time)
+        (pose,) = station.GetOutputPort("object_poses").Eval(simulator.get_context())
+        assert pose.translation()[2] == pytest.approx(0.06, abs=5e-4)
+
+
+def test_an_object_of_an_unknown_shape(tmp_path):
+    shape = "<sphere><radius>0.03</radius></sphere>"
+    _, scenario = load_scenario(write_station(tmp_path, shape))
+    station = MakeSimulatedStation(scenario.station)
+    with pytest.raises(InputError, match="'target' must be a box or a cylinder"):
+        start(station, STATE[:6], nominal_physics(1))
+
+
 def test_bad_requests(station):
     with pytest.raises(InputError, match="no model named 'green_box'"):
         MakeSimulatedStation(StationConfig(objects=["green_box"]))
@@ -221,6 +268,8 @@ def test_bad_requests(station):
         MakeSimulatedStation(StationConfig(directives=[only_arm]))
     with pytest.raises(InputError, match="'table' must be one free body"):
         MakeSimulatedStation(StationConfig(objects=["table"]))
+    with pytest.raises(InputError, match="free body 'obstacle_2' of the directives"):
+        MakeSimulatedStation(StationConfig(objects=["target", "obstacle_1"]))
     context = station.CreateDefaultContext()
     with pytest.raises(InputError, match="9 elements for a station of 3 objects"):
         SetStationState(station, context, STATE[:9], nominal_physics(2))

@@ -25,7 +25,8 @@ from rhp_drake.station.ports import NUM_JOINTS
 from rhp_drake.station.station_models import (
     AddStationModels,
     StationConfig,
-    only_body,
+    as_input_errors,
+    object_bodies,
 )
 from rhp_drake.visualization import FRAME_PERIOD
 
@@ -58,8 +59,8 @@ class MeasuredPositions(LeafSystem):
         numbers = np.arange(float(plant.num_positions()))
         self._arm_rows = plant.GetPositionsFromArray(arm, numbers).astype(int)
         self._object_starts = [
-            int(plant.get_body(only_body(plant, name)).floating_positions_start())
-            for name in objects
+            int(plant.get_body(body).floating_positions_start())
+            for body in object_bodies(plant, objects)
         ]
         self._arm_port = self.DeclareVectorInputPort("position_measured", NUM_JOINTS)
         self._poses_port = self.DeclareAbstractInputPort(
@@ -101,7 +102,8 @@ def MakeShownStation(config: StationConfig, meshcat: Meshcat) -> Diagram:
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     AddStationModels(config, plant, scene_graph)
-    plant.Finalize()
+    with as_input_errors():
+        plant.Finalize()
     positions = builder.AddNamedSystem(
         "positions", MeasuredPositions(plant, config.objects)
     )

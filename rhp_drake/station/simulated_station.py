@@ -17,10 +17,10 @@ from rhp_drake.station.position_servo import PositionServo
 from rhp_drake.station.station_models import (
     AddStationModels,
     StationConfig,
-    only_body,
+    as_input_errors,
+    object_bodies,
 )
 from rhp_drake.station.ur5_kinematics import PUSHING_HEIGHT, inverse_kinematics
-from rhp_drake.task import BOX_SIDE
 from rhp_drake.visualization import FRAME_PERIOD
 
 
@@ -38,13 +38,15 @@ def MakeSimulatedStation(
         meshcat: Where to show it, if anywhere.
 
     Raises:
-        InputError: If the directives lack the arm, the hand or an object.
+        InputError: If Drake refuses directives or settings, the arm, the hand or an
+            object is lacking, or a free body is no object.
     """
     robot_builder = RobotDiagramBuilder(time_step=config.plant.time_step)
     builder, plant = robot_builder.builder(), robot_builder.plant()
     scene_graph = robot_builder.scene_graph()
-    ApplyMultibodyPlantConfig(config.plant, plant)
-    scene_graph.set_config(config.scene_graph)
+    with as_input_errors():
+        ApplyMultibodyPlantConfig(config.plant, plant)
+        scene_graph.set_config(config.scene_graph)
     AddStationModels(config, plant, scene_graph)
     arm = plant.GetModelInstanceByName("ur5")
     for name in ("ur5", "hand"):
@@ -53,7 +55,8 @@ def MakeSimulatedStation(
     for joint, (p, d) in zip(JOINT_NAMES, gains, strict=True):
         actuator = plant.GetJointActuatorByName(joint, arm)
         actuator.set_controller_gains(PdControllerGains(p=p, d=d))
-    plant.Finalize()
+    with as_input_errors():
+        plant.Finalize()
 
     servo = builder.AddNamedSystem(
         "servo", PositionServo(plant.GetDefaultPositions(arm))
@@ -72,7 +75,7 @@ def MakeSimulatedStation(
     builder.ExportOutput(split.get_output_port(1), "ur5.velocity_estimated")
     builder.ExportOutput(state, "ur5.state_estimated")
 
-    bodies = [only_body(plant, name) for name in config.objects]
+    bodies = object_bodies(plant, config.objects)
     object_poses = builder.AddNamedSystem(
         "object_poses", ObjectPoses(config.objects, bodies)
     )
@@ -109,7 +112,7 @@ def SetStationState(
 ) -> None:
     """Puts the whole station at rest in a planar state, under some physics.
 
-    The hand is at its pushing height, the boxes stand on the table.
+    The hand is at its pushing height, the objects stand on the table.
 
     Args:
         station: From `MakeSimulatedStation`.
@@ -118,8 +121,8 @@ def SetStationState(
         physics: Of the m objects.
 
     Raises:
-        InputError: If the station has not m objects, or if the arm cannot reach the
-            hand's pose.
+        InputError: If the station has not m objects, one of them is neither box nor
+            cylinder, or the arm cannot reach the hand's pose.
     """
     objects = station.GetSubsystemByName("object_poses").objects
     if len(state) != 3 + 3 * len(objects):
@@ -129,7 +132,7 @@ def SetStationState(
         )
     plant, scene_graph = station.plant(), station.scene_graph()
     plant_context = station.GetMutableSubsystemContext(plant, station_context)
-    set_object_physics(
+    heights = set_object_physics(
         physics,
         objects,
         plant=plant,
@@ -144,9 +147,11 @@ def SetStationState(
     plant.SetPositions(plant_context, plant.GetModelInstanceByName("ur5"), q)
     servo = station.GetSubsystemByName("servo")
     servo.Hold(station.GetMutableSubsystemContext(servo, station_context), q)
-    for name, (x, y, theta) in zip(objects, state[3:].reshape(-1, 3), strict=True):
+    poses = state[3:].reshape(-1, 3)
+    for name, height, (x, y, theta) in zip(objects, heights, poses, strict=True):
+        (body,) = plant.GetBodyIndices(plant.GetModelInstanceByName(name))
         plant.SetFloatingBaseBodyPoseInWorldFrame(
             plant_context,
-            plant.get_body(only_body(plant, name)),
-            RigidTransform(RotationMatrix.MakeZRotation(theta), [x, y, BOX_SIDE / 2]),
+            plant.get_body(body),
+            RigidTransform(RotationMatrix.MakeZRotation(theta), [x, y, height / 2]),
         )

@@ -3,8 +3,12 @@
 In simulation the plant is the world; on hardware it is what is shown.
 """
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
+import numpy as np
 from pydrake.geometry import (
     DefaultProximityProperties,
     Rgba,
@@ -24,6 +28,7 @@ from pydrake.multibody.tree import BodyIndex
 
 from rhp_drake.errors import InputError
 from rhp_drake.resources import make_package_map
+from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 
 _TARGET_COLOR = Rgba(0.20, 0.66, 0.33)
 _OBSTACLE_COLOR = Rgba(0.80, 0.16, 0.14)
@@ -83,6 +88,49 @@ class StationConfig:
         default_factory=lambda: [600.0, 600.0, 300.0, 40.0, 40.0, 20.0]
     )
 
+    def validate(self) -> None:
+        """Raises an InputError if a value is impossible."""
+        if not self.objects or len(set(self.objects)) < len(self.objects):
+            raise InputError(
+                "station.objects: must be names of different objects, at least one, "
+                f"not {self.objects}."
+            )
+        time_step = self.plant.time_step
+        if not 0 < time_step <= COMMAND_PERIOD:
+            raise InputError(
+                "station.plant.time_step: must be above 0 and at most the period of "
+                f"commands, {COMMAND_PERIOD} s, not {time_step}."
+            )
+        for name in ("position_gains", "velocity_gains"):
+            gains = getattr(self, name)
+            good = len(gains) == NUM_JOINTS and np.isfinite(gains).all()
+            if not good or min(gains) < 0:
+                raise InputError(
+                    f"station.{name}: must be {NUM_JOINTS} finite numbers, none of "
+                    f"them negative, not {gains}."
+                )
+
+
+def resolve_directives(config: StationConfig, folder: Path) -> None:
+    """Makes URIs of the directives' plain paths, which are relative to a folder.
+
+    Drake itself takes nothing but URIs here.
+    """
+    for directive in config.directives:
+        for added in (directive.add_model, directive.add_directives):
+            if added is not None and "://" not in added.file:
+                added.file = (folder / added.file).as_uri()
+
+
+@contextmanager
+def as_input_errors() -> Iterator[None]:
+    """Makes InputErrors of what Drake says about models and settings in a scenario."""
+    try:
+        yield
+    except (RuntimeError, ValueError, SystemExit) as error:
+        # A failed assertion in Drake comes as a SystemExit.
+        raise InputError(f"station: {error}") from error
+
 
 def AddStationModels(
     config: StationConfig, plant: MultibodyPlant, scene_graph: SceneGraph
@@ -95,11 +143,13 @@ def AddStationModels(
         scene_graph: Where its geometry goes.
 
     Raises:
-        InputError: If the directives lack the arm, the hand or an object.
+        InputError: If the directives cannot be processed, or lack the arm, the hand or
+            an object.
     """
     parser = Parser(plant, scene_graph)
     parser.package_map().AddMap(make_package_map())
-    ProcessModelDirectives(ModelDirectives(directives=config.directives), parser)
+    with as_input_errors():
+        ProcessModelDirectives(ModelDirectives(directives=config.directives), parser)
     for name in ("ur5", "hand", *config.objects):
         if not plant.HasModelInstanceNamed(name):
             raise InputError(f"the station's directives add no model named '{name}'.")
@@ -107,12 +157,26 @@ def AddStationModels(
         _paint(plant, scene_graph, name, _OBSTACLE_COLOR if i else _TARGET_COLOR)
 
 
-def only_body(plant: MultibodyPlant, name: str) -> BodyIndex:
-    """The free body that the object `name` is."""
-    bodies = plant.GetBodyIndices(plant.GetModelInstanceByName(name))
-    if len(bodies) != 1 or not plant.get_body(bodies[0]).is_floating_base_body():
-        raise InputError(f"the object '{name}' must be one free body.")
-    return bodies[0]
+def object_bodies(plant: MultibodyPlant, objects: Sequence[str]) -> list[BodyIndex]:
+    """The free bodies that the objects are, of a plant that is finalized.
+
+    Raises:
+        InputError: If an object is not one free body, or one is not among the objects:
+            it would be pushed without the planner's knowing.
+    """
+    found = []
+    for name in objects:
+        bodies = plant.GetBodyIndices(plant.GetModelInstanceByName(name))
+        if len(bodies) != 1 or not plant.get_body(bodies[0]).is_floating_base_body():
+            raise InputError(f"the object '{name}' must be one free body.")
+        found += bodies
+    for body in sorted(plant.GetFloatingBaseBodies() - set(found)):
+        model = plant.get_body(body).model_instance()
+        raise InputError(
+            f"station.objects: the free body '{plant.GetModelInstanceName(model)}' of "
+            "the directives is not among them."
+        )
+    return found
 
 
 def _paint(
