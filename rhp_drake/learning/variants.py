@@ -34,8 +34,9 @@ def _acting(**changes: Any) -> Rounds:
 
 BEST: Final = Variant()
 # Section V: Q-learning on plans and on what was executed, squared errors, a gradient
-# step for each action (an episode has some 16).  The loss of imitation stays, which the
-# paper does not say: it is to hold down the values of actions that were never tried.
+# step for each action (an episode has some 16).  Not in the paper are the symmetries,
+# the target network and its bounds, rounds, and that the loss of imitation stays: it is
+# to hold down the values of actions that were never tried.
 PAPER: Final = Variant(
     learning=FittedQConfig(
         learning_rate=1e-4,
