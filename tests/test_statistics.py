@@ -1,9 +1,12 @@
+"""Statistics of tables, against published and hand-made values."""
+
 import numpy as np
 import pytest
 
 from rhp_drake.evaluation.machine import describe_machine
 from rhp_drake.evaluation.statistics import (
     bootstrap_interval,
+    format_grouped_rate,
     format_rate,
     t_interval,
     wilson_interval,
@@ -32,6 +35,16 @@ def test_rate_of_nothing_can_be_anything():
 
 def test_format_rate():
     assert format_rate(81, 263) == "30.8 (25.5-36.6)"
+
+
+def test_trials_of_the_same_tasks_say_less():
+    """Where all trials of a task go alike, more of them say nothing new."""
+    once = np.arange(20) < 15
+    alike = np.array([once, once, once])
+    assert format_grouped_rate(alike) == format_rate(15, 20)
+    # Where they do not, they count as so many of different tasks.
+    apart = np.array([np.roll(once, 5 * k) for k in range(4)])
+    assert format_grouped_rate(apart) == format_rate(60, 80)
 
 
 def test_t_interval_by_hand():

@@ -140,7 +140,7 @@ def test_progress_is_measured_on_validation_tasks(monkeypatch):
         return load_instances(name, num_objects)
 
     monkeypatch.setattr(validation, "load_instances", load)
-    assert validation.greedy_successes(SetQNetwork(3))[1] == 2
+    assert len(validation.greedy_successes(SetQNetwork(3))) == 2
     assert asked == [VALIDATION]
 
 

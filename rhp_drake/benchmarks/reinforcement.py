@@ -66,20 +66,20 @@ class Training:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What came of it, on the first `num_tasks` validation tasks.
+    """What came of it, on the first validation tasks.
 
     Attributes:
         training: Which one.
         curve: Gradient steps, and how many tasks the greedy policy solved then.
-        rhp33: How many RHP-33 solves in the end.
-        num_tasks: Of how many.
+        greedy: Whether it solves each task in the end.
+        rhp33: Whether RHP-33 does.
         num_transitions: Of RHP's acting that it learned from.
     """
 
     training: Training
     curve: tuple[tuple[int, int], ...]
-    rhp33: int
-    num_tasks: int
+    greedy: tuple[bool, ...]
+    rhp33: tuple[bool, ...]
     num_transitions: int
 
 
@@ -173,8 +173,8 @@ class Trainings:
         return TrainingResult(
             training,
             tuple((step, successes) for step, successes in noted["curve"]),
-            noted["rhp33"],
-            noted["num_tasks"],
+            tuple(noted["greedy"]),
+            tuple(noted["rhp33"]),
             noted["num_transitions"],
         )
 
@@ -219,17 +219,22 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
     curve = json.loads(curve_path.read_text()) if curve_path.exists() else {}
     described = _describe(training)
     for event in train(learner, checkpoint, described, reinforcement):
-        if isinstance(event, Stepped) and (
-            event.num_steps % _PERIOD == 0 or event.num_steps == config.num_steps
+        # The last one is below.
+        if (
+            isinstance(event, Stepped)
+            and event.num_steps % _PERIOD == 0
+            and event.num_steps < config.num_steps
         ):
             # Steps that are taken again after a stop have the same successes.
-            curve[str(event.num_steps)], _ = greedy_successes(network)
+            curve[str(event.num_steps)] = sum(greedy_successes(network))
             write_atomically(curve_path, json.dumps(curve))
+    greedy = greedy_successes(network)
+    curve[str(config.num_steps)] = sum(greedy)
     result = TrainingResult(
         training,
         tuple((int(step), successes) for step, successes in curve.items()),
-        _rhp33_successes(network),
-        _NUM_TASKS,
+        tuple(greedy),
+        tuple(_rhp33_successes(network)),
         reinforcement.num_transitions,
     )
     network.provenance = {
@@ -237,8 +242,8 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
         "seed": training.seed,
         "variant": described,
         "curve": result.curve,
+        "greedy": result.greedy,
         "rhp33": result.rhp33,
-        "num_tasks": result.num_tasks,
         "num_transitions": result.num_transitions,
     }
     save_q_network(network, path)
@@ -248,9 +253,9 @@ def _train(training: Training, trainings: Trainings) -> TrainingResult:
     return result
 
 
-def _rhp33_successes(network: QNetwork) -> int:
+def _rhp33_successes(network: QNetwork) -> list[bool]:
     push_model = PushModel(NUM_OBJECTS)
     policy = RecedingHorizon(push_model, deepcopy(network).cpu(), 3, 3, 0.5)
     instances = load_instances(VALIDATION)[:_NUM_TASKS]
     episodes = run_episodes(push_model.step, policy, instances)
-    return sum(episode.succeeded for episode in episodes)
+    return [episode.succeeded for episode in episodes]

@@ -84,7 +84,7 @@ def reinforcement(
     }
     curves = {
         name: [
-            ([step for step, _ in r.curve], [n / r.num_tasks for _, n in r.curve])
+            ([step for step, _ in r.curve], [n / len(r.greedy) for _, n in r.curve])
             for r in of_variant
         ]
         for name, of_variant in by_variant.items()
@@ -97,15 +97,17 @@ def reinforcement(
 
 def _table(by_variant: "dict[str, list[TrainingResult]]", steps: int) -> "Table":
     """Success of all seeds together, and of each."""
+    import numpy as np
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    from rhp_drake.evaluation.statistics import format_rate
+    from rhp_drake.evaluation.statistics import format_grouped_rate
 
-    def cells(successes: "Sequence[int]", num_tasks: int) -> list[str]:
+    def cells(of_seeds: "Sequence[Sequence[bool]]") -> list[str]:
+        succeeded = np.array(of_seeds)
         return [
-            format_rate(sum(successes), num_tasks * len(successes)),
-            ", ".join(f"{100 * number / num_tasks:.1f}" for number in successes),
+            format_grouped_rate(succeeded),
+            ", ".join(f"{100 * rate:.1f}" for rate in succeeded.mean(axis=1)),
         ]
 
     table = Table(
@@ -120,12 +122,11 @@ def _table(by_variant: "dict[str, list[TrainingResult]]", steps: int) -> "Table"
     for heading in ("GP", "by seed", "RHP-33", "by seed", "transitions"):
         table.add_column(heading, justify="right")
     for name, results in by_variant.items():
-        num_tasks = results[0].num_tasks
         transitions = sum(r.num_transitions for r in results) / len(results)
         table.add_row(
             name,
-            *cells([r.curve[-1][1] for r in results], num_tasks),
-            *cells([r.rhp33 for r in results], num_tasks),
+            *cells([r.greedy for r in results]),
+            *cells([r.rhp33 for r in results]),
             f"{transitions:.0f}",
         )
     return table

@@ -62,9 +62,7 @@ def train_and_save(
         console.print(f"{out}: is there already.")
         return
     try:
-        successes, trials = _train(
-            learner, out, checkpoint, origin, console, reinforcement
-        )
+        solved = _train(learner, out, checkpoint, origin, console, reinforcement)
     except KeyboardInterrupt:
         console.print("Stopped; the same command goes on from its last checkpoint.")
         raise typer.Exit(130) from None
@@ -82,7 +80,7 @@ def train_and_save(
         "command": " ".join(["rhp", *sys.argv[1:]]),
         "commit": commit,
         **origin,
-        "validation_successes_of_gp": f"{successes} of {trials}",
+        "validation_successes_of_gp": f"{sum(solved)} of {len(solved)}",
         **asdict(learner.config),  # type: ignore[call-overload]
         "loss": learner.mean_loss,
     }
@@ -92,8 +90,8 @@ def train_and_save(
     # Last, because without it the work would be taken for done.
     checkpoint.unlink(missing_ok=True)
     console.print(
-        f"{out}: {out.stat().st_size / 1e3:.0f} kB, greedily solves {successes} of "
-        f"{trials} validation tasks."
+        f"{out}: {out.stat().st_size / 1e3:.0f} kB, greedily solves {sum(solved)} of "
+        f"{len(solved)} validation tasks."
     )
 
 
@@ -116,8 +114,8 @@ def _train(
     origin: dict[str, Any],
     console: "Console",
     reinforcement: "Reinforcement | None",
-) -> tuple[int, int]:
-    """Trains; returns how many validation tasks are solved greedily, of how many."""
+) -> list[bool]:
+    """Trains; returns whether each validation task is solved greedily then."""
     from torch.utils.tensorboard import SummaryWriter
 
     from rhp_drake.commands.progress import make_progress
@@ -149,8 +147,8 @@ def _train(
                 progress.update(bar, completed=step, description=f"loss {loss:.3f}")
                 writer.add_scalar("loss", loss, step)
             if step % _VALIDATION_PERIOD == 0 and step < total:
-                successes, trials = greedy_successes(learner.network)
-                writer.add_scalar("greedy success", successes / trials, step)
-        successes, trials = greedy_successes(learner.network)
-        writer.add_scalar("greedy success", successes / trials, total)
-    return successes, trials
+                solved = greedy_successes(learner.network)
+                writer.add_scalar("greedy success", sum(solved) / len(solved), step)
+        solved = greedy_successes(learner.network)
+        writer.add_scalar("greedy success", sum(solved) / len(solved), total)
+    return solved

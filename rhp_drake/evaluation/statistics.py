@@ -51,6 +51,13 @@ def grouped_wilson_interval(
     return wilson_interval(rate * independent, independent)
 
 
+def format_grouped_rate(succeeded: np.ndarray) -> str:
+    """As `format_rate`, of trials (T, K) on K tasks; see `grouped_wilson_interval`."""
+    trials = np.full(succeeded.shape[1], len(succeeded))
+    low, high = grouped_wilson_interval(succeeded.sum(axis=0), trials)
+    return f"{100 * succeeded.mean():.1f} ({100 * low:.1f}-{100 * high:.1f})"
+
+
 def format_rate(successes: int, trials: int) -> str:
     """A success rate in percent with its Wilson interval, e.g. ``88.0 (84.9-90.6)``."""
     low, high = wilson_interval(successes, trials)

@@ -10,8 +10,7 @@ from rhp_drake.value.q_network import QNetwork
 _NUM_TASKS: Final = 200
 
 
-def greedy_successes(network: QNetwork) -> tuple[int, int]:
-    """How many of some validation tasks the greedy policy solves, and of how many."""
+def greedy_successes(network: QNetwork) -> list[bool]:
+    """Whether the greedy policy solves each of the first validation tasks."""
     instances = load_instances(VALIDATION, network.num_objects)[:_NUM_TASKS]
-    episodes = greedy_episodes(network, instances)
-    return sum(episode.succeeded for episode in episodes), len(instances)
+    return [episode.succeeded for episode in greedy_episodes(network, instances)]
