@@ -145,6 +145,9 @@ def test_run_json_and_recording(rhp, tmp_path, capsys):
     assert record["scenario"]["time_limit"] == 2.5
     assert record["scenario"]["policy"]["horizon"] == 3
     assert record["versions"]["drake"]
+    assert record["hardware"] is None
+    instance = make_task_instance(load_scenario("three_boxes", None, ["seed: 8"])[1])
+    assert record["goals"] == instance.goals.tolist()
     assert record["outcome"]["num_actions"] == len(record["decisions"]) >= 2
 
     # The same without Meshcat, and from the record itself.
@@ -166,6 +169,7 @@ def test_ctrl_c_keeps_the_record(rhp, monkeypatch):
     assert code == 130
     assert record["outcome"]["status"] == "interrupted"
     assert record["outcome"]["target_distance"] is None
+    assert record["goals"] is None
 
 
 def test_graphviz(monkeypatch, tmp_path):

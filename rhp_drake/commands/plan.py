@@ -50,8 +50,10 @@ def plan(
     with Meshcat.  The exit status is 0 if the plan succeeded or, with
     --no-execute, was found; 1 if not, 2 for bad input, 130 after Ctrl-C.
     """
+    from rhp_drake.run_record import check_simulated
     from rhp_drake.scenario import load_scenario
 
+    check_simulated(scenario)
     config = CheckedPlanConfig if checked else OpenLoopConfig
     limit = {} if time_limit is None else {"time_limit": time_limit}
     overrides = [

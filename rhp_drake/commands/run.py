@@ -64,8 +64,11 @@ def run(
         if text
     ]
 
+    from rhp_drake.run_record import check_simulated
     from rhp_drake.scenario import load_scenario
 
+    if hardware is None:
+        check_simulated(scenario)
     title, config = load_scenario(scenario, name, overrides)
     if graphviz is not None:
         _write_graphviz(config, graphviz)
@@ -141,6 +144,6 @@ def _run(
     # To draw what comes last takes its time: by now the arm has been stopped.
     simulator.get_system().ForcedPublish(simulator.get_context())
     task_run.write_recording(meshcat, folder)
-    task_run.write_run(run, scenario, folder)
+    task_run.write_run(run, scenario, folder, config)
     task_run.say_outcome(console, run, folder)
     return run.outcome

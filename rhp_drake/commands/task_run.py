@@ -15,6 +15,7 @@ from rhp_drake.errors import InputError
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
+    import numpy as np
     from pydrake.geometry import Meshcat
     from pydrake.systems.analysis import Simulator
     from rich.console import Console
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from rhp_drake.planning.policy import Policy
     from rhp_drake.run_closed_loop import Outcome
     from rhp_drake.scenario import Scenario
+    from rhp_drake.station.hardware_station import HardwareConfig
     from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 
 INTERRUPTED: Final = "interrupted"
@@ -59,11 +61,14 @@ class TaskRun:
     Attributes:
         outcome: How it ended; its status is `INTERRUPTED` after Ctrl-C.
         decisions: All of them, in order.
+        goals: Centres of the goal regions, shape (m, 2), m in W; None if Ctrl-C came
+            before the first decision.
         times: What the clock on the wall said.
     """
 
     outcome: "Outcome"
     decisions: "list[DecisionRecord]"
+    goals: "np.ndarray | None"
     times: dict[str, Any]
 
 
@@ -205,7 +210,12 @@ def run_task(
         )
     seconds = time.perf_counter() - clock
     times = {"started": started.isoformat(timespec="seconds"), "seconds": seconds}
-    return TaskRun(outcome, decisions, times)
+    goals = None
+    # Before, they may not have been set.
+    if decisions or outcome.status != INTERRUPTED:
+        port = simulator.get_system().GetOutputPort("goals")
+        goals = port.Eval(simulator.get_context()).reshape(-1, 2)
+    return TaskRun(outcome, decisions, goals, times)
 
 
 def _run(
@@ -243,11 +253,23 @@ def _run(
     )
 
 
-def write_run(run: TaskRun, scenario: "Scenario", folder: Path) -> None:
-    """Writes run.json to `folder`."""
+def write_run(
+    run: TaskRun,
+    scenario: "Scenario",
+    folder: Path,
+    hardware: "HardwareConfig | None" = None,
+) -> None:
+    """Writes run.json to `folder`; see `make_run_record`."""
     from rhp_drake.run_record import make_run_record, write_record
 
-    record = make_run_record(scenario, run.decisions, run.outcome, run.times)
+    record = make_run_record(
+        scenario,
+        run.decisions,
+        run.outcome,
+        run.times,
+        goals=run.goals,
+        hardware=hardware,
+    )
     write_record(folder / RUN_FILE, record)
 
 
