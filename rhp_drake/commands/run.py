@@ -45,7 +45,9 @@ def run(
     ] = True,
     graphviz: Annotated[
         Path | None,
-        typer.Option(help="Write the diagram to this file, and do not run."),
+        typer.Option(
+            help="Write the diagram, simulated, to this file, and do not run."
+        ),
     ] = None,
     out: task_run.Out = None,
 ) -> None:
@@ -67,6 +69,8 @@ def run(
     from rhp_drake.run_record import check_simulated
     from rhp_drake.scenario import load_scenario
 
+    if graphviz is not None and hardware is not None:
+        raise InputError("--graphviz: draws the simulated loop, without --hardware.")
     if hardware is None:
         check_simulated(scenario)
     title, config = load_scenario(scenario, name, overrides)
@@ -96,6 +100,7 @@ def _write_graphviz(scenario: "Scenario", path: Path) -> None:
         path.write_text(text)
     except OSError as error:
         raise InputError(f"--graphviz: {path}: {error.strerror}.") from None
+    task_run.make_console().print(f"Diagram: {path}")
 
 
 def _run(
