@@ -1,53 +1,20 @@
-"""The command `rhp`: puts its subcommands together, each from `rhp_drake.commands`."""
+"""The entry point of the command `rhp`."""
 
 import sys
 
-import typer
-
-from rhp_drake.commands.bench import bench
-from rhp_drake.commands.calibrate import calibrate
-from rhp_drake.commands.demos import demos
-from rhp_drake.commands.driver import driver
-from rhp_drake.commands.evaluate import evaluate
-from rhp_drake.commands.figure4 import figure4
-from rhp_drake.commands.lab import lab
-from rhp_drake.commands.learn import imitate, reinforce
-from rhp_drake.commands.plan import plan
-from rhp_drake.commands.report import report
-from rhp_drake.commands.run import run
 from rhp_drake.errors import InputError, WorkError
-
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    # A traceback is for developers; it need not fill the screen with variables.
-    pretty_exceptions_show_locals=False,
-)
-for command in (
-    run,
-    lab,
-    driver,
-    calibrate,
-    plan,
-    imitate,
-    reinforce,
-    evaluate,
-    report,
-    figure4,
-):
-    app.command()(command)
-app.add_typer(demos, name="demos")
-app.add_typer(bench, name="bench")
-
-
-@app.callback()
-def rhp() -> None:
-    """Receding-horizon planning with a learned value function, in Drake."""
 
 
 def main() -> None:
-    """The entry point: bad input is one sentence on stderr and exit status 2."""
+    """Runs the command, and ends with its exit status.
+
+    Bad input is one sentence on stderr and exit status 2; Ctrl-C, where the command
+    does not say more, is "Stopped." and 130.
+    """
     try:
+        # Imported here, for Ctrl-C may come meanwhile.
+        from rhp_drake.commands.app import app
+
         app()
     except InputError as error:
         print(f"rhp: {error}", file=sys.stderr)
@@ -55,6 +22,22 @@ def main() -> None:
     except WorkError as error:
         print(f"rhp: {error}", file=sys.stderr)
         sys.exit(1)
+    except (KeyboardInterrupt, ImportError, SystemExit) as error:
+        if not _is_interrupt(error):
+            raise
+        print("Stopped.", file=sys.stderr)
+        sys.exit(130)
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether an error comes of Ctrl-C.
+
+    Extension modules make an ImportError of it, Typer a SystemExit.
+    """
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        context = None if error.__suppress_context__ else error.__context__
+        error = error.__cause__ or context
+    return error is not None
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 import fcntl
+import itertools
 import os
 from pathlib import Path
 from typing import Final
@@ -24,6 +25,30 @@ def make_folder(path: Path) -> None:
         raise InputError(f"{path}: no folder can be made: {error.strerror}.") from None
     if not os.access(path, os.W_OK):
         raise InputError(f"{path}: this folder cannot be written to.")
+
+
+def make_new_folder(path: Path) -> Path:
+    """Makes a folder that was not there, and returns it.
+
+    If `path` is there, it is called as `path` with _2, _3 and so on after its name: no
+    two processes get the same.
+
+    Raises:
+        InputError: If it cannot be made.
+    """
+    make_folder(path.parent)
+    for number in itertools.count(1):
+        folder = path if number == 1 else path.with_name(f"{path.name}_{number}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise InputError(
+                f"{folder}: no folder can be made: {error.strerror}."
+            ) from None
+        break
+    return folder
 
 
 def check_writable(path: Path) -> None:

@@ -11,11 +11,15 @@ import platform
 import subprocess
 from typing import Any, Final
 
+import numpy as np
+
 from rhp_drake import typed_yaml
+from rhp_drake.errors import InputError
 from rhp_drake.files import write_atomically
 from rhp_drake.resources import resolve
 from rhp_drake.run_closed_loop import Outcome
 from rhp_drake.scenario import Scenario
+from rhp_drake.station.hardware_station import HardwareConfig
 from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 from rhp_drake.task import Action
 
@@ -27,21 +31,31 @@ def make_run_record(
     decisions: Sequence[DecisionRecord],
     outcome: Outcome,
     times: dict[str, Any],
+    *,
+    goals: np.ndarray | None,
+    hardware: HardwareConfig | None = None,
 ) -> dict[str, Any]:
     """Everything about a run, ready for JSON.
 
     The same scenario gives the same record but for `times` and each decision's
     `milliseconds`.  A record is a scenario file, too: ``rhp run run.json --name
-    scenario`` repeats the run.
+    scenario`` repeats the run, unless it was on hardware; see `check_simulated`.
 
     Args:
         scenario: In full, whatever file or defaults it came from.
         decisions: All of them, in order.
         outcome: How the run ended.
         times: What the clock on the wall said.
+        goals: Centres of the goal regions, shape (m, 2), m in W; None if the run ended
+            before there were any.  On hardware the scenario does not say them.
+        hardware: The robot and the tracker; None for a simulation.
     """
     return {
         "scenario": typed_yaml.expand(scenario),
+        "hardware": None if hardware is None else typed_yaml.expand(hardware),
+        "goals": None
+        if goals is None
+        else [[_finite(x), _finite(y)] for x, y in goals],
         "seed": scenario.seed,
         "versions": _versions(),
         "q_network_sha256": _q_network_checksum(scenario),
@@ -55,6 +69,24 @@ def make_run_record(
 def write_record(path: Path, record: dict[str, Any]) -> None:
     """Writes a record as JSON, all of it or nothing."""
     write_atomically(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
+
+
+def check_simulated(path: Path) -> None:
+    """Refuses to simulate what was not simulated; whatever else `path` is, is fine.
+
+    Raises:
+        InputError: If `path` is the record of a run on hardware.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return  # No record; whoever loads it says what is wrong, if anything is.
+    if isinstance(record, dict) and "outcome" in record and record.get("hardware"):
+        raise InputError(
+            f"{path}: this run was on hardware and began where robot and objects were, "
+            "which the scenario in it does not say; `rhp run --hardware` runs it there "
+            "again."
+        )
 
 
 def source_commit() -> str:

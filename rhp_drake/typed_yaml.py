@@ -9,6 +9,8 @@ import dataclasses
 import difflib
 from pathlib import Path
 import re
+import types
+import typing
 from typing import Any, Final, TypeVar
 
 from pydrake.common.yaml import (
@@ -74,6 +76,9 @@ def read_file(path: Path) -> dict[str, Any]:
 def merge(node: dict[str, Any], defaults: _T, where: str) -> _T:
     """A copy of `defaults`, a dataclass, with the values of `node` in it.
 
+    Where several kinds are possible, a mapping without a tag is of the default's kind,
+    and keeps the rest of it.
+
     Args:
         node: A part of what `read_document` returned.
         defaults: What the keys that `node` does not have keep.
@@ -90,11 +95,13 @@ def merge(node: dict[str, Any], defaults: _T, where: str) -> _T:
                 f"{where}: {key}: expected a mapping, '!Tag {{key: value}}' or "
                 f"'{{key: value}}', not {value!r}."
             )
+    node = _with_tags(node, defaults)
     error = _attempt(node, defaults)
     if error is not None:
         blamed = _blame(node, lambda part: _attempt(part, defaults))
-        key, value, error = blamed or ("its keys", node, error)
-        raise InputError(f"{where}: {key}: {_explain(error, key, value, defaults)}.")
+        key, value, tag, error = blamed or ("its keys", node, None, error)
+        problem = _explain(error, key, value, tag, defaults)
+        raise InputError(f"{where}: {key}: {problem}.")
     return yaml_load_typed(data=yaml_dump(node), defaults=defaults)
 
 
@@ -104,6 +111,30 @@ def expand(value: Any) -> dict[str, Any]:
     `merge` reads the result back: tags are kept under the key "_tag".
     """
     return yaml_load(data=yaml_dump_typed(value))
+
+
+def _with_tags(node: dict[str, Any], defaults: Any) -> dict[str, Any]:
+    """A copy of `node`; mappings that need a tag and have none have their default's.
+
+    Without it Drake would take a union's first type, and lose the default.
+    """
+    node = dict(node)
+    for field in dataclasses.fields(defaults):
+        value, default = node.get(field.name), getattr(defaults, field.name)
+        if not isinstance(value, dict) or not dataclasses.is_dataclass(default):
+            continue
+        tag = f"!{type(default).__name__}"
+        if value.get(_TAG, tag) == tag:
+            value = _with_tags(value, default)
+            node[field.name] = ({_TAG: tag} if _is_union(field.type) else {}) | value
+    return node
+
+
+def _is_union(kind: Any) -> bool:
+    """Whether values of this type need a tag; those of "X | None" do not."""
+    if typing.get_origin(kind) not in (typing.Union, types.UnionType):
+        return False
+    return len({*typing.get_args(kind)} - {types.NoneType}) > 1
 
 
 def _attempt(node: dict[str, Any], defaults: Any) -> Exception | None:
@@ -119,7 +150,7 @@ def _attempt(node: dict[str, Any], defaults: Any) -> Exception | None:
 
 def _blame(
     node: Any, attempt: Callable[[Any], Exception | None], path: str = ""
-) -> tuple[str, Any, Exception] | None:
+) -> tuple[str, Any, str | None, Exception] | None:
     """Finds the innermost key whose value fails on its own.
 
     Args:
@@ -128,8 +159,8 @@ def _blame(
         path: Where `node` is.
 
     Returns:
-        The key's path (e.g. "policy.horizon"), its value and the error; None if each
-        part of `node` is fine.
+        The key's path (e.g. "policy.horizon"), its value, the tag of the mapping that
+        it is in, if any, and the error; None if each part of `node` is fine.
     """
     keys: Iterable[Any] = ()
     if isinstance(node, dict):
@@ -155,7 +186,8 @@ def _blame(
         deeper = None
         if empty is not None and attempt_part(empty) is None:
             deeper = _blame(value, attempt_part, inner)
-        return deeper or (inner, value, error)
+        tag = node.get(_TAG) if isinstance(node, dict) else None
+        return deeper or (inner, value, tag, error)
     return None
 
 
@@ -166,14 +198,18 @@ def _empty(node: Any) -> Any:
     return [] if isinstance(node, list) else None
 
 
-def _explain(error: Exception, key: str, value: Any, defaults: Any) -> str:
-    """Drake's error in a user's words, without the full stop."""
+def _explain(
+    error: Exception, key: str, value: Any, tag: str | None, defaults: Any
+) -> str:
+    """Drake's error in a user's words, without the full stop; see `_blame`."""
     message = str(error)
     if "unknown to the schema" in message:
         name = key.rpartition(".")[2]
+        place = f" in {tag}" if tag else ""
         close = difflib.get_close_matches(name, _names(expand(defaults)), n=1)
-        hint = f"; perhaps {close[0]!r} is meant" if close else ""
-        return f"there is no such key{hint}"
+        # A key that is known elsewhere is no misspelling.
+        hint = f"; perhaps {close[0]!r} is meant" if close not in ([], [name]) else ""
+        return f"there is no such key{place}{hint}"
     if "type tag" in message and isinstance(value, dict):
         known = [f"!{name}" for name in re.findall(r"(\w+)'>", message)]
         return f"{value.get(_TAG)} is none of {', '.join(known)}"

@@ -1,3 +1,5 @@
+"""The command `rhp` as its user meets it."""
+
 import subprocess
 import sys
 
@@ -54,6 +56,65 @@ def test_help_needs_neither_drake_nor_torch():
     assert "imported []" in result.stdout
     for command in COMMANDS:
         assert f" {command} " in result.stdout
+
+
+def raising(error):
+    def raise_error(*arguments, **options):
+        raise error
+
+    return raise_error
+
+
+def extension_interrupted() -> ImportError:
+    """What comes of Ctrl-C while an extension module is imported."""
+    error = ImportError("initialization failed")
+    error.__cause__ = KeyboardInterrupt()
+    return error
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), extension_interrupted()])
+def test_ctrl_c_anywhere(error, monkeypatch, capsys):
+    monkeypatch.setattr("rhp_drake.scenario.load_scenario", raising(error))
+    assert rhp(monkeypatch, "run", "three_boxes") == 130
+    printed = capsys.readouterr()
+    assert printed.err == "Stopped.\n"
+    assert printed.out == ""
+
+
+def test_ctrl_c_while_the_commands_are_imported():
+    code = (
+        "import sys\n"
+        "from rhp_drake import cli\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, *arguments):\n"
+        "        raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+        "cli.main()"
+    )
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 130
+    assert result.stderr == "Stopped.\n"
+
+
+def test_commands_say_themselves_what_ctrl_c_did(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(
+        "rhp_drake.learning.demonstration_folder.demonstrate_tasks",
+        raising(KeyboardInterrupt()),
+    )
+    out = str(tmp_path / "data")
+    assert rhp(monkeypatch, "demos", "--plans", "3", "--out", out) == 130
+    printed = capsys.readouterr()
+    assert "Stopped; the same command goes on from here." in printed.out
+    assert printed.err == ""
+
+
+def test_other_import_errors_are_for_developers(monkeypatch):
+    error = ImportError("broken installation")
+    monkeypatch.setattr("rhp_drake.scenario.load_scenario", raising(error))
+    monkeypatch.setattr("sys.argv", ["rhp", "run", "three_boxes"])
+    with pytest.raises(ImportError, match="broken"):
+        cli.main()
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -170,6 +170,9 @@ def test_run_json_and_recording(rhp, tmp_path, capsys):
     assert record["scenario"]["time_limit"] == 2.5
     assert record["scenario"]["policy"]["horizon"] == 3
     assert record["versions"]["drake"]
+    assert record["hardware"] is None
+    instance = make_task_instance(load_scenario("three_boxes", None, ["seed: 8"])[1])
+    assert record["goals"] == instance.goals.tolist()
     assert record["outcome"]["num_actions"] == len(record["decisions"]) >= 2
 
     # The same without Meshcat, and from the record itself.
@@ -191,9 +194,10 @@ def test_ctrl_c_keeps_the_record(rhp, monkeypatch):
     assert code == 130
     assert record["outcome"]["status"] == "interrupted"
     assert record["outcome"]["target_distance"] is None
+    assert record["goals"] is None
 
 
-def test_graphviz(monkeypatch, tmp_path):
+def test_graphviz(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(POLICY, lambda *args, **kwargs: RandomPolicy())
     path = tmp_path / "diagram.dot"
     arguments = ["rhp", "run", "three_boxes", "--graphviz", str(path)]
@@ -203,6 +207,20 @@ def test_graphviz(monkeypatch, tmp_path):
     assert info.value.code == 0
     for system in ("station", "state_estimator", "planner", "command_guard"):
         assert system in path.read_text()
+    assert capsys.readouterr().out == f"Diagram: {path}\n"
+
+
+def test_graphviz_is_of_the_simulated_loop(monkeypatch, tmp_path, capsys):
+    path = tmp_path / "diagram.dot"
+    arguments = ["three_boxes", "--hardware", "missing", "--graphviz", str(path)]
+    monkeypatch.setattr("sys.argv", ["rhp", "run", *arguments])
+    with pytest.raises(SystemExit) as info:
+        cli.main()
+    assert info.value.code == 2
+    assert capsys.readouterr().err == (
+        "rhp: --graphviz: draws the simulated loop, without --hardware.\n"
+    )
+    assert not path.exists()
 
 
 def test_scenarios_start_at_rest():

@@ -1,7 +1,10 @@
 """The hardware station: the ports of the simulated one, and what stands behind them."""
 
+from contextlib import nullcontext
 from dataclasses import replace
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
@@ -10,14 +13,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import EventStatus
 import pytest
 
+from rhp_drake import cli, typed_yaml
 from rhp_drake.closed_loop import Hardware, MakeClosedLoop, MakeStation
 from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.errors import InputError
+from rhp_drake.hardware import load_hardware
 from rhp_drake.planning.policy import Decision
 from rhp_drake.run_closed_loop import output_of, run_on_hardware
 from rhp_drake.safety import Fault
-from rhp_drake.scenario import Scenario
-from rhp_drake.station.hardware_station import MeasureStation
+from rhp_drake.scenario import Scenario, load_scenario, make_task_instance
+from rhp_drake.station.hardware_station import HardwareConfig, MeasureStation
 from rhp_drake.station.ports import COMMAND_PERIOD, declared_ports, station_ports
 from rhp_drake.station.ur5_kinematics import hand_pose, inverse_kinematics
 from rhp_drake.systems.meshcat_overlay import MeshcatOverlay
@@ -249,3 +254,43 @@ def test_bad_models(hardware):
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     with pytest.raises(InputError, match="add no model named 'green_box'"):
         MakeStation(scenario, meshcat, hardware)
+
+
+def test_the_record_says_what_hardware_it_was(hardware, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    monkeypatch.setattr(
+        "rhp_drake.hardware.running_hardware",
+        lambda config, num_objects: nullcontext(hardware),
+    )
+    path = tmp_path / "first" / "run.json"
+
+    def rhp(command, *arguments):
+        options = ("--no-meshcat", "--scenario-text", "{time_limit: 0.5}")
+        monkeypatch.setattr("sys.argv", ["rhp", command, *arguments, *options])
+        with pytest.raises(SystemExit) as info:
+            cli.main()
+        return info.value.code
+
+    on_lab = ("--policy", "random", "--hardware", "virtual_lab", "--out")
+    assert rhp("run", "three_boxes", *on_lab, str(path.parent)) == 1
+    record = json.loads(path.read_text())
+    config = typed_yaml.merge(record["hardware"], HardwareConfig(), "run.json")
+    expected = load_hardware(Path("virtual_lab"))
+    assert typed_yaml.expand(config) == typed_yaml.expand(expected)
+    # Obstacles are to stay where they were.
+    np.testing.assert_allclose(record["goals"][1:], BOXES[1:, :2], atol=1e-9)
+    goal = make_task_instance(load_scenario("three_boxes")[1]).goals[0]
+    assert record["goals"][0] == goal.tolist()
+
+    # That is not what a simulation would do.
+    capsys.readouterr()
+    again = (str(path), "--name", "scenario")
+    for command in ("run", "plan"):
+        assert rhp(command, *again) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1
+        assert lines[0].startswith(f"rhp: {path}: this run was on hardware ")
+    # On hardware it is.
+    assert rhp("run", *again, *on_lab, str(tmp_path / "second")) == 1
+    second = json.loads((tmp_path / "second" / "run.json").read_text())
+    assert second["goals"] == record["goals"]

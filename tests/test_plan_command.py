@@ -1,6 +1,7 @@
 """`rhp plan` as its user meets it."""
 
 from dataclasses import replace
+from datetime import datetime
 import json
 
 import numpy as np
@@ -20,6 +21,7 @@ easy:
       - position: [0.3, 0.2]
       - position: [0.3, -0.2]
 """
+SHORT = ("--no-realtime", "--scenario-text", "{time_limit: 1.0e-3}")
 PLAN = "rhp_drake.planning.kinodynamic_rrt.plan"
 
 
@@ -156,6 +158,32 @@ def test_says_how_near_the_target_came(rhp, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(PLAN, plan)
     assert rhp("plan", "--no-meshcat", "--out", "out") == 1
     assert "target at best 8.0 cm from its goal" in capsys.readouterr().out
+
+
+def test_a_folder_never_mixes_runs(rhp, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("run.json", "recording.html", "notes.txt"):
+        (out / name).write_text("earlier")
+    assert rhp("plan", "--no-meshcat", "--no-execute", "--out", "out") == 0
+    assert names(out) == ["notes.txt", "plan.json"]
+    assert rhp("run", "--no-meshcat", "--policy", "random", *SHORT, "--out", "out") == 1
+    assert names(out) == ["notes.txt", "run.json"]
+
+
+def test_runs_of_the_same_second_have_folders_of_their_own(rhp, tmp_path, monkeypatch):
+    class Clock(datetime):
+        @classmethod
+        def now(cls):
+            return cls(2026, 1, 2, 3, 4, 5)
+
+    monkeypatch.setattr("rhp_drake.commands.task_run.datetime", Clock)
+    for _ in range(3):
+        assert rhp("run", "--no-meshcat", "--policy", "random", *SHORT) == 1
+    folders = names(tmp_path / "runs")
+    assert folders == [f"2026-01-02_03-04-05{end}" for end in ("", "_2", "_3")]
+    for folder in folders:
+        assert names(tmp_path / "runs" / folder) == ["run.json"]
 
 
 def test_ctrl_c_in_the_search(rhp, tmp_path, monkeypatch, capsys):

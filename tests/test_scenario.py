@@ -1,3 +1,6 @@
+"""Scenario files: what they may say, what is wrong with them, and overrides."""
+
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +12,13 @@ from rhp_drake.frozen_instances import SETS, load_instances
 from rhp_drake.planning.policy_config import (
     GreedyConfig,
     MakePolicy,
+    OpenLoopConfig,
     RecedingHorizonConfig,
 )
 from rhp_drake.resources import scenarios_path
 from rhp_drake.scenario import (
     Layout,
+    PlanarPose,
     SampledInstance,
     Scenario,
     load_scenario,
@@ -108,6 +113,55 @@ def test_overrides_in_order(tmp_path):
     assert scenario.policy == RecedingHorizonConfig(horizon=2)
 
 
+def test_override_without_a_tag_keeps_the_kind(tmp_path):
+    path = write(tmp_path, "a: {policy: !GreedyConfig {rescue: true}}")
+    _, scenario = load_scenario(path, overrides=["policy: {q_network: w}"])
+    assert scenario.policy == GreedyConfig(q_network="w", rescue=True)
+    path = write(tmp_path, layout())
+    _, scenario = load_scenario(path, overrides=["task: {goal: [0.7, 0.1]}"])
+    assert isinstance(scenario.task, Layout)
+    np.testing.assert_array_equal(scenario.task.goal, [0.7, 0.1])
+    np.testing.assert_array_equal(scenario.task.target.position, [0.5, 0.0])
+    # A tag chooses another kind, with its defaults.
+    _, scenario = load_scenario(path, overrides=["task: !SampledInstance {}"])
+    assert scenario.task == SampledInstance()
+
+
+def test_override_of_a_key_that_the_kind_does_not_have():
+    for text, message in (
+        (
+            "policy: {num_roll_outs: 3}",
+            "policy.num_roll_outs: there is no such key in !OpenLoopConfig.",
+        ),
+        # Known, but elsewhere.
+        ("task: {seed: 3}", "task.seed: there is no such key in !Layout."),
+    ):
+        overridden = typed_yaml.read_document(text, "text")
+        defaults = Scenario(policy=OpenLoopConfig(), task=Layout())
+        with pytest.raises(InputError) as info:
+            typed_yaml.merge(overridden, defaults, "text")
+        assert str(info.value) == f"text: {message}"
+
+
+def test_kinds_of_nested_parts_are_kept():
+    @dataclass
+    class Inner:
+        task: SampledInstance | Layout = field(default_factory=SampledInstance)
+        port: PlanarPose | None = field(default_factory=PlanarPose)
+
+    @dataclass
+    class Outer:
+        inner: Inner = field(default_factory=Inner)
+
+    defaults = Outer(Inner(Layout(goal=np.ones(2)), PlanarPose(heading_deg=3.0)))
+    node = {"inner": {"task": {"hand": {"heading_deg": 5}}, "port": {"position": [1]}}}
+    merged = typed_yaml.merge(node, defaults, "text").inner
+    assert isinstance(merged.task, Layout)
+    assert merged.task.goal.tolist() == [1, 1]
+    assert merged.task.hand.heading_deg == 5
+    assert merged.port.heading_deg == 3
+
+
 def test_defaults_are_not_shared():
     first, second = Scenario(), Scenario()
     first.station.objects.append("another")
@@ -129,7 +183,8 @@ def test_expanded_scenario_loads_again(tmp_path):
         ("a: {station: {plant: {tim_step: 1}}}", ": a: station.plant.tim_step: there"),
         (
             "a: {policy: {horizn: 3}}",
-            ": a: policy.horizn: there is no such key; perhaps 'horizon' is meant.",
+            ": a: policy.horizn: there is no such key in !RecedingHorizonConfig; "
+            "perhaps 'horizon' is meant.",
         ),
         (
             "a: {station: {directives: [{}, {add_modl: {}}]}}",

@@ -3,7 +3,7 @@
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -50,8 +50,10 @@ def plan(
     with Meshcat.  The exit status is 0 if the plan succeeded or, with
     --no-execute, was found; 1 if not, 2 for bad input, 130 after Ctrl-C.
     """
+    from rhp_drake.run_record import check_simulated
     from rhp_drake.scenario import load_scenario
 
+    check_simulated(scenario)
     config = CheckedPlanConfig if checked else OpenLoopConfig
     limit = {} if time_limit is None else {"time_limit": time_limit}
     overrides = [
@@ -61,8 +63,7 @@ def plan(
         f"policy: !{config.__name__} {json.dumps(limit)}",
     ]
     title, loaded = load_scenario(scenario, name, [text for text in overrides if text])
-    folder = out or task_run.default_folder()
-    raise typer.Exit(_plan(title, loaded, execute, realtime, meshcat, folder))
+    raise typer.Exit(_plan(title, loaded, execute, realtime, meshcat, out))
 
 
 def _plan(
@@ -71,18 +72,22 @@ def _plan(
     execute: bool,
     realtime: bool,
     use_meshcat: bool,
-    folder: Path,
+    out: Path | None,
 ) -> int:
     """Plans, shows, executes, and writes the results; returns the exit status."""
     from rhp_drake.commands.shown_planner import ShownPlanner
     from rhp_drake.commands.tree_drawing import TreeDrawing
-    from rhp_drake.files import make_folder
     from rhp_drake.planning.policy_config import MakePolicy
+    from rhp_drake.run_record import write_record
 
     meshcat = task_run.start_meshcat(scenario) if use_meshcat else None
     drawing = TreeDrawing(meshcat) if meshcat is not None else None
     console = task_run.make_console()
-    planner = ShownPlanner(scenario, console, drawing, folder)
+
+    def on_plan(record: dict[str, Any]) -> None:
+        write_record(folder / task_run.PLAN_FILE, record)
+
+    planner = ShownPlanner(scenario, console, drawing, on_plan)
     policy = MakePolicy(
         scenario.policy,
         len(scenario.station.objects),
@@ -90,7 +95,7 @@ def _plan(
         planner=planner,
     )
     simulator = task_run.make_simulator(scenario, policy, meshcat, realtime)
-    make_folder(folder)
+    folder = task_run.start_folder(out)
     task_run.say_title(console, title, scenario, meshcat)
     shown = 0
 
@@ -108,16 +113,17 @@ def _plan(
 
     # The planning is part of the loop, from the state that the robot measures.  So
     # `rhp run` on run.json finds the same plan.
-    with task_run.recorded(meshcat, folder):
-        try:
-            run = task_run.run_task(simulator, scenario, console, on_decision)
-        except _NotExecutedError:
-            run = None
-        # No decision has shown a search that failed or was interrupted.
-        if drawing is not None and planner.num_begun > shown:
-            drawing.show_from(simulator.get_context().get_time())
-        # What comes last, a fault for one.
-        simulator.get_system().ForcedPublish(simulator.get_context())
+    task_run.start_recording(meshcat)
+    try:
+        run = task_run.run_task(simulator, scenario, console, on_decision)
+    except _NotExecutedError:
+        run = None
+    # No decision has shown a search that failed or was interrupted.
+    if drawing is not None and planner.num_begun > shown:
+        drawing.show_from(simulator.get_context().get_time())
+    # What comes last, a fault for one.
+    simulator.get_system().ForcedPublish(simulator.get_context())
+    task_run.write_recording(meshcat, folder)
     if run is None:
         console.print(f"Results: {folder}")
         return 0

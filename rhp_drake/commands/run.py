@@ -45,7 +45,9 @@ def run(
     ] = True,
     graphviz: Annotated[
         Path | None,
-        typer.Option(help="Write the diagram to this file, and do not run."),
+        typer.Option(
+            help="Write the diagram, simulated, to this file, and do not run."
+        ),
     ] = None,
     out: task_run.Out = None,
 ) -> None:
@@ -64,14 +66,18 @@ def run(
         if text
     ]
 
+    from rhp_drake.run_record import check_simulated
     from rhp_drake.scenario import load_scenario
 
+    if graphviz is not None and hardware is not None:
+        raise InputError("--graphviz: draws the simulated loop, without --hardware.")
+    if hardware is None:
+        check_simulated(scenario)
     title, config = load_scenario(scenario, name, overrides)
     if graphviz is not None:
         _write_graphviz(config, graphviz)
         return
-    folder = out or task_run.default_folder()
-    outcome = _run(title, config, realtime, meshcat, folder, hardware)
+    outcome = _run(title, config, realtime, meshcat, out, hardware)
     raise typer.Exit(task_run.exit_status(outcome))
 
 
@@ -94,6 +100,7 @@ def _write_graphviz(scenario: "Scenario", path: Path) -> None:
         path.write_text(text)
     except OSError as error:
         raise InputError(f"--graphviz: {path}: {error.strerror}.") from None
+    task_run.make_console().print(f"Diagram: {path}")
 
 
 def _run(
@@ -101,13 +108,12 @@ def _run(
     scenario: "Scenario",
     realtime: bool,
     use_meshcat: bool,
-    folder: Path,
+    out: Path | None,
     hardware_file: Path | None,
 ) -> "Outcome":
-    """Runs the scenario, says what happens, and writes the results to `folder`."""
+    """Runs the scenario, says what happens, and writes the results to `out`."""
     import torch
 
-    from rhp_drake.files import make_folder
     from rhp_drake.hardware import load_hardware, running_hardware
     from rhp_drake.planning.policy_config import MakePolicy
 
@@ -121,27 +127,28 @@ def _run(
     config = load_hardware(hardware_file) if hardware_file is not None else None
     meshcat = task_run.start_meshcat(scenario) if use_meshcat else None
     console = task_run.make_console()
-    with task_run.recorded(meshcat, folder):
-        with ExitStack() as stack:
-            running = None
-            if config is not None:
-                console.print(f"Connecting to {config.description or hardware_file}")
-                m = len(scenario.station.objects)
-                running = stack.enter_context(running_hardware(config, m))
-                if config.lcm is None:
-                    task_run.say_motion(console, dry_run=config.ur.dry_run)
-                else:
-                    console.print("The driver says whether the arm moves.")
-            simulator = task_run.make_simulator(
-                scenario, policy, meshcat, realtime, running
-            )
-            make_folder(folder)
-            task_run.say_title(console, title, scenario, meshcat)
-            run = task_run.run_task(
-                simulator, scenario, console, on_hardware=running is not None
-            )
-        # To draw what comes last takes its time: by now the arm has been stopped.
-        simulator.get_system().ForcedPublish(simulator.get_context())
-    task_run.write_run(run, scenario, folder)
+    task_run.start_recording(meshcat)
+    with ExitStack() as stack:
+        running = None
+        if config is not None:
+            console.print(f"Connecting to {config.description or hardware_file}")
+            m = len(scenario.station.objects)
+            running = stack.enter_context(running_hardware(config, m))
+            if config.lcm is None:
+                task_run.say_motion(console, dry_run=config.ur.dry_run)
+            else:
+                console.print("The driver says whether the arm moves.")
+        simulator = task_run.make_simulator(
+            scenario, policy, meshcat, realtime, running
+        )
+        folder = task_run.start_folder(out)
+        task_run.say_title(console, title, scenario, meshcat)
+        run = task_run.run_task(
+            simulator, scenario, console, on_hardware=running is not None
+        )
+    # To draw what comes last takes its time: by now the arm has been stopped.
+    simulator.get_system().ForcedPublish(simulator.get_context())
+    task_run.write_recording(meshcat, folder)
+    task_run.write_run(run, scenario, folder, config)
     task_run.say_outcome(console, run, folder)
     return run.outcome

@@ -1,7 +1,7 @@
 """The kinodynamic RRT as `rhp plan` shows it: how its search comes on, and its plan."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 import time
 from typing import Any
 
@@ -15,20 +15,19 @@ from rhp_drake.commands.tree_drawing import TreeDrawing
 from rhp_drake.planning import kinodynamic_rrt
 from rhp_drake.planning.search import Growth, Plan
 from rhp_drake.push_model.transition import PushModel
-from rhp_drake.run_record import write_record
 from rhp_drake.scenario import Scenario
 from rhp_drake.task import GOAL_RADIUS, Action, object_positions
 
 
 @dataclass
 class ShownPlanner:
-    """Plans as `kinodynamic_rrt.plan` does, and shows how; writes the first plan down.
+    """Plans as `kinodynamic_rrt.plan` does, and shows how.
 
     Attributes:
-        scenario: Goes to plan.json.
+        scenario: Goes to the record.
         console: Where to say how the search comes on.
         drawing: Where to draw the tree, None for nowhere.
-        folder: Of plan.json.
+        on_plan: Called with the record of the first plan, ready for JSON.
         num_begun: How many searches began.
         num_ended: How many came to an end.
     """
@@ -36,7 +35,7 @@ class ShownPlanner:
     scenario: Scenario
     console: Console
     drawing: TreeDrawing | None
-    folder: Path
+    on_plan: Callable[[dict[str, Any]], None]
     num_begun: int = 0
     num_ended: int = 0
 
@@ -82,19 +81,13 @@ class ShownPlanner:
         if growth is not None:
             self.console.print(_progress(growth, nearest, found.seconds))
         if self.num_ended == 0:
-            self._write(found, goals, growth)
+            self.on_plan(_make_record(self.scenario, found, goals, growth))
             if found.actions is not None:
                 self.console.print(_make_table(found.actions, found.states, goals))
         elif found.actions is not None:
             self.console.print(f"A new plan of {len(found.actions)} actions.")
         self.num_ended += 1
         return found
-
-    def _write(self, found: Plan, goals: np.ndarray, growth: Growth | None) -> None:
-        write_record(
-            self.folder / "plan.json",
-            _make_record(self.scenario, found, goals, growth),
-        )
 
 
 def _nearest(states: np.ndarray, goals: np.ndarray) -> float:

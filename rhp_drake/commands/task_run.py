@@ -1,7 +1,6 @@
 """What `rhp run` and `rhp plan` share: one task in closed loop, told and recorded."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 import logging
@@ -12,8 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from rhp_drake.errors import InputError
+
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
+    import numpy as np
     from pydrake.geometry import Meshcat
     from pydrake.systems.analysis import Simulator
     from rich.console import Console
@@ -22,9 +24,14 @@ if TYPE_CHECKING:
     from rhp_drake.planning.policy import Policy
     from rhp_drake.run_closed_loop import Outcome
     from rhp_drake.scenario import Scenario
+    from rhp_drake.station.hardware_station import HardwareConfig
     from rhp_drake.systems.receding_horizon_planner import DecisionRecord
 
 INTERRUPTED: Final = "interrupted"
+# What a run leaves in its folder.
+RUN_FILE: Final = "run.json"
+PLAN_FILE: Final = "plan.json"
+_RECORDING_FILE: Final = "recording.html"
 
 # Options of both commands.
 ScenarioFile = Annotated[
@@ -40,7 +47,10 @@ ScenarioText = Annotated[
 ]
 Realtime = Annotated[bool, typer.Option(help="Run no faster than reality.")]
 Out = Annotated[
-    Path | None, typer.Option(help="Folder of the results, by default runs/TIME.")
+    Path | None,
+    typer.Option(
+        help="Folder of the results, by default runs/TIME; replaces an earlier run's."
+    ),
 ]
 
 
@@ -51,17 +61,39 @@ class TaskRun:
     Attributes:
         outcome: How it ended; its status is `INTERRUPTED` after Ctrl-C.
         decisions: All of them, in order.
+        goals: Centres of the goal regions, shape (m, 2), m in W; None if Ctrl-C came
+            before the first decision.
         times: What the clock on the wall said.
     """
 
     outcome: "Outcome"
     decisions: "list[DecisionRecord]"
+    goals: "np.ndarray | None"
     times: dict[str, Any]
 
 
-def default_folder() -> Path:
-    """A new name for each run, which sorts by time."""
-    return Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
+def start_folder(out: Path | None) -> Path:
+    """Makes the folder of a run's results, without those of an earlier run.
+
+    Args:
+        out: The folder; None for a new one, whose name sorts by time.
+
+    Raises:
+        InputError: If it cannot be made, or an earlier result not be removed.
+    """
+    from rhp_drake.files import make_folder, make_new_folder
+
+    if out is None:
+        return make_new_folder(Path("runs") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
+    make_folder(out)
+    for name in (RUN_FILE, PLAN_FILE, _RECORDING_FILE):
+        try:
+            (out / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{out / name}: cannot be removed: {error.strerror}."
+            ) from None
+    return out
 
 
 def make_console() -> "Console":
@@ -117,20 +149,22 @@ def say_motion(console: "Console", *, dry_run: bool) -> None:
     console.print(f"The arm {moves}.", style="bold")
 
 
-@contextmanager
-def recorded(meshcat: "Meshcat | None", folder: Path) -> Iterator[None]:
-    """Records what happens, and writes it to recording.html in `folder`."""
-    from rhp_drake.files import write_atomically
+def start_recording(meshcat: "Meshcat | None") -> None:
+    """Records what is shown from now on."""
     from rhp_drake.visualization import FRAME_PERIOD
 
-    if meshcat is None:
-        yield
-        return
-    meshcat.StartRecording(frames_per_second=1 / FRAME_PERIOD)
-    yield
-    meshcat.StopRecording()
-    meshcat.PublishRecording()
-    write_atomically(folder / "recording.html", meshcat.StaticHtml())
+    if meshcat is not None:
+        meshcat.StartRecording(frames_per_second=1 / FRAME_PERIOD)
+
+
+def write_recording(meshcat: "Meshcat | None", folder: Path) -> None:
+    """Writes what has been recorded to recording.html in `folder`."""
+    from rhp_drake.files import write_atomically
+
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        write_atomically(folder / _RECORDING_FILE, meshcat.StaticHtml())
 
 
 def run_task(
@@ -176,7 +210,12 @@ def run_task(
         )
     seconds = time.perf_counter() - clock
     times = {"started": started.isoformat(timespec="seconds"), "seconds": seconds}
-    return TaskRun(outcome, decisions, times)
+    goals = None
+    # Before, they may not have been set.
+    if decisions or outcome.status != INTERRUPTED:
+        port = simulator.get_system().GetOutputPort("goals")
+        goals = port.Eval(simulator.get_context()).reshape(-1, 2)
+    return TaskRun(outcome, decisions, goals, times)
 
 
 def _run(
@@ -214,12 +253,24 @@ def _run(
     )
 
 
-def write_run(run: TaskRun, scenario: "Scenario", folder: Path) -> None:
-    """Writes run.json to `folder`."""
+def write_run(
+    run: TaskRun,
+    scenario: "Scenario",
+    folder: Path,
+    hardware: "HardwareConfig | None" = None,
+) -> None:
+    """Writes run.json to `folder`; see `make_run_record`."""
     from rhp_drake.run_record import make_run_record, write_record
 
-    record = make_run_record(scenario, run.decisions, run.outcome, run.times)
-    write_record(folder / "run.json", record)
+    record = make_run_record(
+        scenario,
+        run.decisions,
+        run.outcome,
+        run.times,
+        goals=run.goals,
+        hardware=hardware,
+    )
+    write_record(folder / RUN_FILE, record)
 
 
 def say_outcome(console: "Console", run: TaskRun, folder: Path) -> None:
