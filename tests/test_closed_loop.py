@@ -11,6 +11,7 @@ from rhp_drake import cli, task
 from rhp_drake.closed_loop import AddClosedLoop, MakeClosedLoop
 from rhp_drake.physics import draw_physics, nominal_physics
 from rhp_drake.planning.policy import Decision
+from rhp_drake.planning.policy_config import named_policy
 from rhp_drake.random_streams import stream
 from rhp_drake.run_closed_loop import output_of, run_closed_loop
 from rhp_drake.scenario import Scenario, load_scenario, make_task_instance
@@ -142,6 +143,18 @@ def rhp(monkeypatch, tmp_path):
         return info.value.code, json.loads((tmp_path / out / "run.json").read_text())
 
     return run_rhp
+
+
+@pytest.mark.parametrize("name", ["gp", "rhp33", "rhp66_rescue"])
+def test_another_policy_keeps_the_weights(name, rhp, tmp_path):
+    paper = "package://rhp_drake/q_network/paper.safetensors"
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"mine: {{time_limit: 0.1, policy: {{q_network: {paper}}}}}\n")
+    _, record = rhp("out", str(file), "--policy", name, "--no-meshcat")
+    policy = record["scenario"]["policy"]
+    assert policy["q_network"] == paper
+    tag = policy.get("_tag", "!RecedingHorizonConfig")
+    assert tag == f"!{type(named_policy(name)).__name__}"
 
 
 def without_times(record: dict) -> dict:

@@ -11,7 +11,7 @@ import typer
 
 from rhp_drake.commands import task_run
 from rhp_drake.errors import InputError
-from rhp_drake.planning.policy_config import POLICIES, named_policy
+from rhp_drake.planning.policy_config import POLICIES, PolicyConfig, named_policy
 
 # Drake and torch are imported in the functions, so that `rhp --help` is quick.
 if TYPE_CHECKING:
@@ -56,16 +56,6 @@ def run(
     Writes run.json and, with Meshcat, recording.html.  The exit status is 0 if the
     task succeeded, 1 if it failed, 2 for bad input, 130 after Ctrl-C.
     """
-    overrides = [
-        text
-        for text in (
-            _policy_text(policy) if policy is not None else None,
-            f"seed: {seed}" if seed is not None else None,
-            scenario_text,
-        )
-        if text
-    ]
-
     from rhp_drake.run_record import check_simulated
     from rhp_drake.scenario import load_scenario
 
@@ -73,6 +63,14 @@ def run(
         raise InputError("--graphviz: draws the simulated loop, without --hardware.")
     if hardware is None:
         check_simulated(scenario)
+    overrides = []
+    if policy is not None:
+        _, present = load_scenario(scenario, name)
+        overrides.append(_policy_text(policy, present.policy))
+    if seed is not None:
+        overrides.append(f"seed: {seed}")
+    if scenario_text:
+        overrides.append(scenario_text)
     title, config = load_scenario(scenario, name, overrides)
     if graphviz is not None:
         _write_graphviz(config, graphviz)
@@ -81,10 +79,12 @@ def run(
     raise typer.Exit(task_run.exit_status(outcome))
 
 
-def _policy_text(name: str) -> str:
-    """A policy as scenario text, which leaves the weights as they are."""
+def _policy_text(name: str, present: PolicyConfig) -> str:
+    """A policy as scenario text, which leaves the weights as they are at present."""
     config = named_policy(name)
-    values = {k: v for k, v in asdict(config).items() if k != "q_network"}
+    values = asdict(config)
+    if "q_network" in values:
+        values["q_network"] = getattr(present, "q_network", values["q_network"])
     return f"policy: !{type(config).__name__} {json.dumps(values)}"
 
 
