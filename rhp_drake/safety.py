@@ -45,7 +45,8 @@ class Fault(enum.IntEnum):
 
 _SENTENCES: Final = {
     Fault.NONE: "nothing is wrong.",
-    Fault.NOT_FINITE: "a command or a measured joint position is not finite.",
+    Fault.NOT_FINITE: "a command, a measured joint position or an object's pose is not "
+    "finite.",
     Fault.POSITION_LIMIT: "a command is beyond a joint's position limit.",
     Fault.VELOCITY_LIMIT: "a command is too far from the one before.",
     Fault.TRACKING_ERROR: "a joint is too far from where it was commanded.",
@@ -64,6 +65,12 @@ _SENTENCES: Final = {
     Fault.IMPLAUSIBLE_MEASUREMENT: "the robot tells what cannot be.",
     Fault.LET_GO: "who commanded the arm let it go while it moved.",
 }
+
+
+def to_fault(number: float) -> Fault:
+    """The fault of this number; of one that nobody knows, `Fault.NOT_RUNNING`."""
+    # Numbers that are not whole, and nan, are nobody's either.
+    return Fault(int(number)) if number in _SENTENCES else Fault.NOT_RUNNING
 
 
 def describe(fault: Fault) -> str:
