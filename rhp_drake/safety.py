@@ -43,15 +43,18 @@ class Fault(enum.IntEnum):
     LET_GO = 16
 
 
+# With a limit's key: the guard's are in the scenario, under `guard`, and those of the
+# driver in its own file, under `limits`.
 _SENTENCES: Final = {
     Fault.NONE: "nothing is wrong.",
     Fault.NOT_FINITE: "a command, a measured joint position or an object's pose is not "
     "finite.",
-    Fault.POSITION_LIMIT: "a command is beyond a joint's position limit.",
-    Fault.VELOCITY_LIMIT: "a command is too far from the one before.",
-    Fault.TRACKING_ERROR: "a joint is too far from where it was commanded.",
+    Fault.POSITION_LIMIT: "a command is beyond a joint's limit (position_limits).",
+    Fault.VELOCITY_LIMIT: "a command is too far from the one before (velocity_limit).",
+    Fault.TRACKING_ERROR: "a joint is too far from where it was commanded "
+    "(tracking_limit).",
     Fault.HAND_OUTSIDE: "a command takes the hand out of its workspace or height.",
-    Fault.STALE_POSE: "an object has not been seen for too long.",
+    Fault.STALE_POSE: "an object has not been seen for too long (object_age_limit).",
     Fault.STALE_MEASUREMENT: "the arm has not been heard of for too long.",
     Fault.STALE_COMMAND: "no command came in time.",
     Fault.PROTECTIVE_STOP: "the robot is in a protective stop.",
