@@ -5,10 +5,11 @@ change of the sampling cannot change them.  Training draws from other streams
 (`random_streams`): it never meets them.
 """
 
+from collections.abc import Sequence
 from functools import cache
 import io
 from pathlib import Path
-from typing import Final
+from typing import Final, overload
 
 import numpy as np
 
@@ -24,20 +25,21 @@ _SEED: Final = 0
 _FOLDER: Final = Path(__file__).resolve().parent / "data"
 
 
-def load_instances(name: str, num_objects: int = NUM_OBJECTS) -> list[TaskInstance]:
-    """The 500 instances of a set.
+def load_instances(name: str, num_objects: int = NUM_OBJECTS) -> Sequence[TaskInstance]:
+    """The 500 instances of a set; those that are not stored are drawn one by one.
 
     Args:
         name: "evaluation", which nothing may be tuned on, or "validation".
         num_objects: m; each has a set of its own.
 
     Raises:
-        InputError: If there is no such set.
+        InputError: If there is no such set; as an instance is asked for, if so many
+            objects do not fit.
     """
     if name not in SETS:
         raise InputError(f"{name!r} is not a set of instances: {', '.join(SETS)}.")
     if num_objects != NUM_OBJECTS:
-        return list(_draw_instances(name, num_objects))
+        return _DrawnInstances(name, num_objects)
     with np.load(_FOLDER / f"{name}.npz", allow_pickle=False) as arrays:
         return [
             TaskInstance(state, goals)
@@ -47,12 +49,33 @@ def load_instances(name: str, num_objects: int = NUM_OBJECTS) -> list[TaskInstan
         ]
 
 
+class _DrawnInstances(Sequence[TaskInstance]):
+    """A set whose instances are drawn when they are asked for."""
+
+    def __init__(self, name: str, num_objects: int) -> None:
+        self._name = name
+        self._num_objects = num_objects
+
+    def __len__(self) -> int:
+        return SET_SIZE
+
+    @overload
+    def __getitem__(self, index: int) -> TaskInstance: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[TaskInstance]: ...
+
+    def __getitem__(self, index: int | slice) -> TaskInstance | Sequence[TaskInstance]:
+        asked = range(SET_SIZE)[index]
+        if isinstance(asked, range):
+            return [self[i] for i in asked]
+        return _draw_instance(self._name, self._num_objects, asked)
+
+
 @cache
-def _draw_instances(name: str, num_objects: int) -> tuple[TaskInstance, ...]:
-    return tuple(
-        sample_instance(stream(_SEED, name, "objects", num_objects, i), num_objects)
-        for i in range(SET_SIZE)
-    )
+def _draw_instance(name: str, num_objects: int, index: int) -> TaskInstance:
+    generator = stream(_SEED, name, "objects", num_objects, index)
+    return sample_instance(generator, num_objects)
 
 
 def freeze_instances(name: str, folder: Path = _FOLDER) -> None:

@@ -43,14 +43,18 @@ class Fault(enum.IntEnum):
     LET_GO = 16
 
 
+# With a limit's key: the guard's are in the scenario, under `guard`, and those of the
+# driver in its own file, under `limits`.
 _SENTENCES: Final = {
     Fault.NONE: "nothing is wrong.",
-    Fault.NOT_FINITE: "a command or a measured joint position is not finite.",
-    Fault.POSITION_LIMIT: "a command is beyond a joint's position limit.",
-    Fault.VELOCITY_LIMIT: "a command is too far from the one before.",
-    Fault.TRACKING_ERROR: "a joint is too far from where it was commanded.",
+    Fault.NOT_FINITE: "a command, a measured joint position or an object's pose is not "
+    "finite.",
+    Fault.POSITION_LIMIT: "a command is beyond a joint's limit (position_limits).",
+    Fault.VELOCITY_LIMIT: "a command is too far from the one before (velocity_limit).",
+    Fault.TRACKING_ERROR: "a joint is too far from where it was commanded "
+    "(tracking_limit).",
     Fault.HAND_OUTSIDE: "a command takes the hand out of its workspace or height.",
-    Fault.STALE_POSE: "an object has not been seen for too long.",
+    Fault.STALE_POSE: "an object has not been seen for too long (object_age_limit).",
     Fault.STALE_MEASUREMENT: "the arm has not been heard of for too long.",
     Fault.STALE_COMMAND: "no command came in time.",
     Fault.PROTECTIVE_STOP: "the robot is in a protective stop.",
@@ -64,6 +68,12 @@ _SENTENCES: Final = {
     Fault.IMPLAUSIBLE_MEASUREMENT: "the robot tells what cannot be.",
     Fault.LET_GO: "who commanded the arm let it go while it moved.",
 }
+
+
+def to_fault(number: float) -> Fault:
+    """The fault of this number; of one that nobody knows, `Fault.NOT_RUNNING`."""
+    # Numbers that are not whole, and nan, are nobody's either.
+    return Fault(int(number)) if number in _SENTENCES else Fault.NOT_RUNNING
 
 
 def describe(fault: Fault) -> str:

@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 
+from rhp_drake.errors import InputError
 from rhp_drake.planar_geometry import rectangles_overlap
 
 BOX_SIDE: Final = 0.06  # m, section VII of the paper.
@@ -61,6 +62,11 @@ _BOX_BORDER: Final = 0.03
 _GOAL_BORDER: Final = 0.05
 # ...and this much, in metres, between any two bodies.
 _CLEARANCE: Final = 0.005
+# How often the bodies are placed anew until they do not overlap.  Twelve objects take
+# some 400 trials, sixteen 25000.
+_MAX_TRIALS: Final = 100_000
+# Objects that are looked at first, whatever their number: so many never fit.
+_FIRST_OBJECTS: Final = 30
 
 
 class Action(enum.IntEnum):
@@ -245,8 +251,11 @@ def sample_instance(
 
     Hand, objects and the target's goal are uniform over the workspace (less a
     border); bodies do not overlap, and the goal is not met at the start.
+
+    Raises:
+        InputError: If so many objects do not fit, as far as trying tells.
     """
-    while True:
+    for _ in range(_MAX_TRIALS):
         hand = [
             *generator.uniform(WORKSPACE_LOWER, WORKSPACE_UPPER),
             generator.uniform(-math.pi, math.pi),
@@ -266,7 +275,24 @@ def sample_instance(
             WORKSPACE_LOWER + _GOAL_BORDER, WORKSPACE_UPPER - _GOAL_BORDER
         )
         state = np.concatenate([hand, boxes.ravel()])
-        if not overlapping_bodies(state, _CLEARANCE) and not goals_reached(
-            state, goals
+        if (
+            not _too_close(boxes[:_FIRST_OBJECTS, :2])
+            and not overlapping_bodies(state, _CLEARANCE)
+            and not goals_reached(state, goals)
         ):
             return TaskInstance(state, goals)
+    raise InputError(
+        f"{num_objects} objects do not fit: they overlapped in each of {_MAX_TRIALS} "
+        "random arrangements in the workspace."
+    )
+
+
+def _too_close(positions: np.ndarray) -> bool:
+    """Whether any two of the boxes' centres (k, 2) are so close that they overlap.
+
+    Others may, too; but this is soon told.
+    """
+    x, y = positions.T
+    squares = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
+    # Each is close to itself.
+    return bool((squares < BOX_SIDE**2).sum() > len(positions))

@@ -126,7 +126,9 @@ def test_guard_fault_ends_run():
     scenario.guard = replace(scenario.guard, velocity_limit=1e-3)
     outcome, decisions = run(Simulator(MakeClosedLoop(scenario, RandomPolicy())))
     assert outcome.status == "guard_fault"
-    assert "a command is too far from the one before." in outcome.message
+    assert (
+        "a command is too far from the one before (velocity_limit)." in outcome.message
+    )
     assert len(decisions) == 1
 
 

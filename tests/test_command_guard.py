@@ -216,6 +216,13 @@ def test_bad_config(config):
         ({"roll_deg": 90.0, "object_ages": (0.0, 1.0)}, Fault.STALE_POSE),
         ({"x": 0.531}, Fault.OBJECT_JUMPED),
         ({"arm_fault": Fault.CONNECTION_LOST}, Fault.CONNECTION_LOST),
+        ({"arm_fault": 99}, Fault.NOT_RUNNING),
+        ({"arm_fault": -1}, Fault.NOT_RUNNING),
+        ({"arm_fault": math.nan}, Fault.NOT_RUNNING),
+        ({"arm_fault": math.inf}, Fault.NOT_RUNNING),
+        ({"x": math.nan}, Fault.NOT_FINITE),
+        ({"x": math.inf}, Fault.NOT_FINITE),
+        ({"x": math.nan, "object_ages": (0.0, math.inf)}, Fault.STALE_POSE),
     ],
 )
 def test_old_measurements_and_faults_of_the_robot_stop_the_arm(known, expected):
@@ -239,6 +246,16 @@ def test_objects_may_be_pushed_and_fall_off_the_table():
         assert dut.tick(START)[1] == Fault.NONE
     dut.know(roll_deg=60.0, x=0.95)
     assert dut.tick(START)[1] == Fault.NONE
+
+
+def test_a_pose_turned_by_nan_stops_the_arm():
+    dut = Bench()
+    turned = RigidTransform(np.column_stack([np.full((3, 3), np.nan), [0.5, 0, 0.03]]))
+    poses = [RigidTransform([0.5, 0.2, 0.03]), turned]
+    dut.guard.GetInputPort("object_poses").FixValue(
+        dut.context, AbstractValue.Make(poses)
+    )
+    assert dut.tick(START)[1] == Fault.NOT_FINITE
 
 
 def test_two_objects_that_change_places_stop_the_arm():

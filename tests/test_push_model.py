@@ -1,6 +1,9 @@
 """The push model: against finer physics, against what is exact, and its bits."""
 
+from concurrent.futures import ThreadPoolExecutor
+import copy
 from dataclasses import replace
+import pickle
 
 import numpy as np
 import pytest
@@ -125,6 +128,35 @@ def test_bits_do_not_depend_on_batch_order_or_threads(push_model, pairs):
         push_model.step(states[i : i + 1], actions[i : i + 1])[0] for i in range(20)
     ]
     np.testing.assert_array_equal(one_by_one, expected[:20])
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_python_threads_may_share_it(push_model, pairs, num_threads):
+    expected = push_model.step(*pairs)
+    with (
+        PushModel(3, num_threads) as shared,
+        ThreadPoolExecutor(3) as callers,
+    ):
+        jobs = [callers.submit(shared.step, *pairs) for _ in range(6)]
+        for job in jobs:
+            np.testing.assert_array_equal(job.result(), expected)
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_copies_have_simulators_of_their_own(push_model, pairs, num_threads):
+    expected = push_model.step(*pairs)
+    with PushModel(3, num_threads) as original:
+        original.step(*pairs)
+        for duplicate in (copy.copy, copy.deepcopy, pickled):
+            with duplicate(original) as other, ThreadPoolExecutor(2) as callers:
+                jobs = [callers.submit(m.step, *pairs) for m in (original, other)]
+                for job in jobs:
+                    np.testing.assert_array_equal(job.result(), expected)
+
+
+def pickled(model):
+    """As another process gets it."""
+    return pickle.loads(pickle.dumps(model))
 
 
 @pytest.mark.parametrize("refinement", [0.5, 1, 20])

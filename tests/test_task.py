@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from rhp_drake import task
+from rhp_drake import frozen_instances, task
+from rhp_drake.errors import InputError
 from rhp_drake.frozen_instances import SET_SIZE, load_instances
 from rhp_drake.random_streams import EVALUATION, TRAINING, VALIDATION, stream
 from rhp_drake.task import Action
@@ -116,6 +117,48 @@ def test_sets_for_other_numbers_of_objects():
     assert first[0] != first[1]
     again = load_instances(EVALUATION, 5)[499].initial_state
     np.testing.assert_array_equal(again, five[499].initial_state)
+
+
+def test_of_a_set_only_what_is_asked_for_is_drawn(monkeypatch):
+    drawn = []
+
+    def sample_instance(generator, num_objects):
+        drawn.append(num_objects)
+        return task.sample_instance(generator, num_objects)
+
+    frozen_instances._draw_instance.cache_clear()
+    monkeypatch.setattr(frozen_instances, "sample_instance", sample_instance)
+    five = load_instances(EVALUATION, 5)
+    assert len(five) == SET_SIZE
+    asked = [*five[7:9], five[-1], five[7]]
+    assert drawn == [5] * 3
+    for instance, index in zip(asked, (7, 8, 499, 7), strict=True):
+        alone = task.sample_instance(stream(0, EVALUATION, "objects", 5, index), 5)
+        np.testing.assert_array_equal(instance.initial_state, alone.initial_state)
+        np.testing.assert_array_equal(instance.goals, alone.goals)
+    with pytest.raises(IndexError):
+        five[SET_SIZE]
+
+
+@pytest.mark.parametrize(
+    ("num_objects", "last"),
+    [
+        (1, [0.6040114047492955, 0.1726189417887462]),
+        (3, [0.714744747923407, 0.25581852215876755]),
+        (8, [0.2930206898846948, -0.2630607290999432]),
+    ],
+)
+def test_drawn_tasks_stay_the_same(num_objects, last):
+    """Results name tasks by their numbers alone."""
+    instance = task.sample_instance(stream(7, TRAINING, 3), num_objects)
+    np.testing.assert_allclose(instance.initial_state[-3:-1], last)
+
+
+@pytest.mark.parametrize("num_objects", [20, 200])
+def test_too_many_objects_are_an_error(monkeypatch, num_objects):
+    monkeypatch.setattr(task, "_MAX_TRIALS", 300)
+    with pytest.raises(InputError, match=f"{num_objects} objects do not fit"):
+        task.sample_instance(stream(7, TRAINING, 0), num_objects)
 
 
 def test_streams_depend_on_seed_and_path_alone():

@@ -23,7 +23,7 @@ from rhp_drake.drivers.receiver_process import ReceiverProcess
 from rhp_drake.drivers.rhp_lcm import lcmt_ur_command
 from rhp_drake.drivers.shared_memory import SharedVector
 from rhp_drake.errors import WorkError
-from rhp_drake.safety import NUM_JOINTS, Fault, describe
+from rhp_drake.safety import NUM_JOINTS, Fault, describe, to_fault
 
 if TYPE_CHECKING:
     from pydrake.lcm import DrakeLcmInterface
@@ -33,7 +33,6 @@ _START_TIME: Final = 10.0  # s
 # How often it says that the arm is to follow no more: a datagram may be lost, or find
 # another in the other side's queue.
 _LET_GO_TIMES: Final = 3
-_FAULTS: Final = frozenset(Fault)
 
 
 class LcmArm:
@@ -90,7 +89,7 @@ class LcmArm:
         return ArmMeasurement(
             position,
             velocity,
-            Fault(fault) if fault in _FAULTS else Fault.NOT_RUNNING,
+            to_fault(fault),
             time.monotonic() - measured,
         )
 

@@ -110,7 +110,7 @@ def _demonstrate(task: int, demonstrator: Demonstrator) -> Demonstration:
         key = repr(demonstrator)
         if key not in _residents:
             _residents.clear()
-            # A copy: with a push model, the original could not be sent any more.
+            # A copy: the original is sent to others without what this one gathers.
             _residents[key] = copy(demonstrator)
         return _residents[key].demonstrate(task)
     except PushModelError as error:

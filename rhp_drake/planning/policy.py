@@ -40,8 +40,8 @@ class Decision:
 class Policy(Protocol):
     """Maps states to actions.
 
-    A policy is immutable and may be shared: whoever runs an episode keeps its
-    memory, as a Drake system keeps its state in a context.
+    A policy is immutable and may be shared, by threads too: whoever runs an episode
+    keeps its memory, as a Drake system keeps its state in a context.
     """
 
     def decide(

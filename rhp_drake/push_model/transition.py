@@ -8,8 +8,9 @@ simulated from the first touch on, and not at all if nothing is touched.
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
+from threading import Lock
 from types import TracebackType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -49,10 +50,13 @@ class PushModel:
     the number of threads.  (Drake's batch evaluation would clone a context at every
     call, which costs more than a transition.)
 
+    It may be shared: of several Python threads that step it, one steps at a time, since
+    Drake simulates without Python's lock.  A copy, also one that was pickled, makes
+    simulators of its own.
+
     Args:
         num_objects: The largest m that it can step.
-        num_threads: Threads to spread a batch over; Drake simulates without Python's
-            lock.
+        num_threads: Threads to spread a batch over.
         refinement: Time steps for each piece of a path, whose times must add up as
             those of `TIME_STEP` do; 1 is the push model, 20 a finer reference.
     """
@@ -62,10 +66,23 @@ class PushModel:
     ) -> None:
         self.num_objects = num_objects
         self._time_step = TIME_STEP / refinement
-        self._simulators: list[dict[bytes, Simulator]] = [
-            {} for _ in range(num_threads)
-        ]
-        self._threads = ThreadPoolExecutor(num_threads - 1) if num_threads > 1 else None
+        self._num_threads = num_threads
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Makes what cannot be copied."""
+        n = self._num_threads
+        self._simulators: list[dict[bytes, Simulator]] = [{} for _ in range(n)]
+        self._threads = ThreadPoolExecutor(n - 1) if n > 1 else None
+        self._lock = Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        own = ("_simulators", "_threads", "_lock")
+        return {name: value for name, value in vars(self).items() if name not in own}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._prepare()
 
     def __enter__(self) -> "PushModel":
         return self
@@ -112,7 +129,7 @@ class PushModel:
         columns = np.flatnonzero(touches < STEPS_PER_ACTION)
 
         # A thread that has nothing to do is not worth waking.
-        num_threads = max(1, min(len(self._simulators), len(columns)))
+        num_threads = max(1, min(self._num_threads, len(columns)))
 
         def simulate(thread: int) -> None:
             # Interleaved, so that each thread gets its share of the long ones.
@@ -128,13 +145,16 @@ class PushModel:
                     raise
 
         jobs = []
-        if self._threads is not None:
-            jobs = [self._threads.submit(simulate, k) for k in range(1, num_threads)]
-        try:
-            simulate(0)
-        finally:
-            # After a failure, too: nobody else may use the simulators before.
-            wait(jobs)
+        with self._lock:
+            if self._threads is not None:
+                jobs = [
+                    self._threads.submit(simulate, k) for k in range(1, num_threads)
+                ]
+            try:
+                simulate(0)
+            finally:
+                # After a failure, too: nobody else may use the simulators before.
+                wait(jobs)
         for job in jobs:
             job.result()
         return results

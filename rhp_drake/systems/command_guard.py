@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from rhp_drake.errors import InputError
-from rhp_drake.safety import Fault, JointLimits, check_command
+from rhp_drake.safety import Fault, JointLimits, check_command, to_fault
 from rhp_drake.station.ports import COMMAND_PERIOD, NUM_JOINTS
 from rhp_drake.station.ur5_kinematics import (
     NOMINAL,
@@ -71,10 +71,11 @@ class CommandGuard(LeafSystem):
     """Passes joint commands on as long as they are safe.
 
     At each tick the desired position becomes the command, unless it breaks a limit of
-    the configuration, a measurement is too old, an object is tipped or elsewhere at
-    once, or the robot has a fault of its own.  Then the last command is held, and the
-    fault stays until the simulator is initialized again.  The command starts as the
-    measured position, so that a first desired position far away is refused, too.
+    the configuration, a measurement is too old or not finite, an object is tipped or
+    elsewhere at once, or the robot has a fault of its own.  Then the last command is
+    held, and the fault stays until the simulator is initialized again.  The command
+    starts as the measured position, so that a first desired position far away is
+    refused, too.
 
     Initialization raises a RuntimeError if the measured position is not finite: there
     is nothing safe to command.  Before initialization the command is nan.
@@ -94,8 +95,8 @@ class CommandGuard(LeafSystem):
         - fault
 
     The positions have size 6 (rad), the ages (s) size 1 and m; `arm_fault` and `fault`
-    have size 1, a value of `safety.Fault`.  `object_poses` is a list of the m poses
-    X_WB, z of B upwards.
+    have size 1, a value of `safety.Fault`; an `arm_fault` that is none counts as
+    `NOT_RUNNING`.  `object_poses` is a list of the m poses X_WB, z of B upwards.
 
     Args:
         config: The limits.
@@ -155,7 +156,9 @@ class CommandGuard(LeafSystem):
         if context.get_discrete_state(self._fault).value()[0] != Fault.NONE:
             return
         desired = self._desired_port.Eval(context)
-        fault = self._CheckMeasurements(context)
+        fault = self._CheckArm(context)
+        if fault == Fault.NONE:
+            fault = self._CheckObjects(context)
         if fault == Fault.NONE:
             fault = check_command(
                 self._config,
@@ -172,18 +175,29 @@ class CommandGuard(LeafSystem):
         else:
             discrete_state.set_value(self._fault, np.array([float(fault)]))
 
-    def _CheckMeasurements(self, context: Context) -> Fault:
-        """Finds what is wrong with the robot, or with what is known of the scene."""
-        arm_fault = Fault(int(self._arm_fault_port.Eval(context)[0]))
+    def _CheckArm(self, context: Context) -> Fault:
+        """Finds what is wrong with the robot."""
+        arm_fault = to_fault(self._arm_fault_port.Eval(context)[0])
         if arm_fault != Fault.NONE:
             return arm_fault
         # Written so that nan is too old, too.
         if not self._arm_age_port.Eval(context)[0] <= self._config.arm_age_limit:
             return Fault.STALE_MEASUREMENT
+        return Fault.NONE
+
+    def _CheckObjects(self, context: Context) -> Fault:
+        """Finds what is wrong with what is known of the scene."""
+        # Written so that nan is too old, too.
         ages = self._object_ages_port.Eval(context)
         if not (ages <= self._config.object_age_limit).all():
             return Fault.STALE_POSE
-        positions = self._EvalObjects(context)
+        poses = np.array(
+            [X_WB.GetAsMatrix34() for X_WB in self._object_poses_port.Eval(context)]
+        )
+        # What is nan would be neither on the table nor tipped.
+        if not np.isfinite(poses).all():
+            return Fault.NOT_FINITE
+        positions, upright = poses[:, :2, 3], poses[:, 2, 2]
         before = context.get_discrete_state(self._objects).value().reshape(-1, 2)
         jumps = np.linalg.norm(positions - before, axis=1)
         # Beyond the table's edge it falls, which is for the planner to see.
@@ -191,12 +205,6 @@ class CommandGuard(LeafSystem):
         on_table = inside.all(axis=1)
         if (on_table & (jumps > _LONGEST_JUMP)).any():
             return Fault.OBJECT_JUMPED
-        upright = np.array(
-            [
-                X_WB.rotation().matrix()[2, 2]
-                for X_WB in self._object_poses_port.Eval(context)
-            ]
-        )
         if (on_table & (upright < _LEAST_STANDING)).any():
             return Fault.OBJECT_TILTED
         return Fault.NONE

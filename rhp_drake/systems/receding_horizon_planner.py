@@ -1,4 +1,7 @@
-"""Runs a policy in closed loop: one action at a time, whenever the scene is at rest."""
+"""Runs a policy in closed loop: one action at a time, whenever the scene is at rest.
+
+Any `planning.policy.Policy` will do, not RHP alone.
+"""
 
 from dataclasses import dataclass, replace
 import enum
@@ -122,6 +125,9 @@ class _Episode:
 
 class RecedingHorizonPlanner(LeafSystem):
     """Asks a policy for an action, waits until it is done, and asks again.
+
+    Named for RHP, the paper's policy, it runs any: greedy, KDP (open loop or checked),
+    predictive sampling, MPPI, and random, too.
 
     An action is done when the hand has arrived at its target and the scene is at
     rest.  A decision is executed at the tick after, if nothing has moved since: a real
