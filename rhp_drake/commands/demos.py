@@ -35,7 +35,7 @@ def make(
     context: typer.Context,
     *,
     plans: Annotated[
-        int | None, typer.Option(min=1, help="How many training tasks to solve.")
+        int | None, typer.Option(min=1, help="How many training tasks to try.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the demonstrations.")
