@@ -185,6 +185,11 @@ def _describe(training: Training) -> dict[str, Any]:
 
 
 def _start(architecture: str) -> QNetwork:
+    if architecture == "pair":
+        pair = ARCHITECTURES["pair"](NUM_OBJECTS)
+        for member in pair.members:
+            member.load_state_dict(_start("set").state_dict())
+        return pair
     return load_q_network(resolve(STARTS[architecture]), NUM_OBJECTS)
 
 

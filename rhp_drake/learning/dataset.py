@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -42,6 +43,15 @@ class Dataset:
     search_next_states: np.ndarray
     search_origins: np.ndarray
     solved: np.ndarray
+
+    @cached_property
+    def followers(self) -> np.ndarray:
+        """For each transition, one of those that follow it, or -1; shape (T,)."""
+        followers = np.full(len(self.search_origins), -1)
+        rows = np.random.default_rng(0).permutation(len(followers))
+        rows = rows[self.search_origins[rows] >= 0]
+        followers[self.search_origins[rows]] = rows
+        return followers
 
 
 _COLUMNS: Final = (

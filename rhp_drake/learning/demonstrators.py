@@ -1,12 +1,13 @@
 """Who makes demonstrations: the RRT, a search guided by a Q-network, and RHP."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 import time
 from typing import Final
 
 import numpy as np
 
+from rhp_drake.learning.dataset import Dataset
 from rhp_drake.learning.demonstration import Demonstration, training_task
 from rhp_drake.physics import ObjectPhysics, draw_physics, nominal_physics
 from rhp_drake.planning.best_first import plan_best_first
@@ -111,6 +112,7 @@ class Acting:
     horizon: int = 6
     uncertainty: str = "none"
     executed_only: bool = False
+    resets: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,7 @@ class RecedingHorizonDemonstrator:
     seed: int
     q_network: QNetwork
     acting: Acting = Acting()
+    plans: Dataset | None = field(default=None, repr=False)
 
     @property
     def num_objects(self) -> int:
@@ -158,6 +161,7 @@ class RecedingHorizonDemonstrator:
             instance.initial_state,
             stream(self.seed, TRAINING, task, "world_physics"),
         )
+        instance = self._reset(instance, task)
         states, actions = self._act(instance, physics, task)
         seconds = time.perf_counter() - begin
         search = (
@@ -170,6 +174,20 @@ class RecedingHorizonDemonstrator:
         else:
             found = Plan(None, instance.initial_state[None], search, seconds, np.nan)
         return _demonstration(self.seed, task, instance, found)
+
+    def _reset(self, instance: TaskInstance, task: int) -> TaskInstance:
+        """Now and then a state of a plan, and its goals, instead of a fresh task."""
+        if self.plans is None:
+            return instance
+        generator = stream(self.seed, TRAINING, task, "reset")
+        if generator.random() >= self.acting.resets:
+            return instance
+        row = generator.integers(len(self.plans.plan_states))
+        return replace(
+            instance,
+            initial_state=self.plans.plan_states[row].astype(float),
+            goals=self.plans.goals[self.plans.plan_tasks[row]].astype(float),
+        )
 
     def _act(
         self, instance: TaskInstance, physics: ObjectPhysics, task: int

@@ -57,6 +57,7 @@ class FittedQConfig:
     symmetry: bool = True
     squared_errors: bool = False
     imitation_weight: float = 0.0
+    bootstrap_steps: int = 1
 
 
 def double_q_targets(
@@ -135,12 +136,17 @@ class FittedQ(Learner):
                 ours.lerp_(theirs, self._config.target_rate)
 
     def _loss(self) -> torch.Tensor:
+        members = getattr(self.network, "members", [self.network])
+        return sum(self._member_loss(member) for member in members)
+
+    def _member_loss(self, member) -> torch.Tensor:
         config = self._config
         batch = sample(
             self.sources,
             config.batch_size,
             self._generator,
             hindsight=config.hindsight,
+            foresight=config.bootstrap_steps,
         )
         network = self.network
         symmetry = (
@@ -154,7 +160,7 @@ class FittedQ(Learner):
         states = symmetry.states(self._tensor(batch.states))
         actions = symmetry.actions(self._tensor(batch.actions).long())
         targets = self._targets(batch, symmetry, goals)
-        q = network(states, goals).gather(1, actions[:, None])[:, 0]
+        q = member(states, goals).gather(1, actions[:, None])[:, 0]
         loss = mse_loss if config.squared_errors else smooth_l1_loss
         losses = loss(q, targets, reduction="none")
         # An episode ends at the goal: nobody asks for values there.
@@ -167,19 +173,28 @@ class FittedQ(Learner):
     ) -> torch.Tensor:
         """What the values (N,) of a batch should be, seen through the symmetries."""
         config = self._config
-        next_states = symmetry.states(self._tensor(batch.next_states))
-        allowed = self._tensor(allowed_actions(batch.next_states))
-        target_q_next = self._target(next_states, goals)
-        targets = double_q_targets(
+        targets = self._one_step(batch.next_states, batch, symmetry, goals)
+        if config.bootstrap_steps > 1:
+            later = self._one_step(batch.later_states, batch, symmetry, goals)
+            before = self._tensor(batch.later_steps).float() - 1
+            targets = torch.maximum(targets, REWARD * before + later)
+        least = self._tensor(batch.least_returns).float()
+        return torch.maximum(targets, least)
+
+    def _one_step(self, arrays, batch, symmetry, goals):
+        config = self._config
+        next_states = symmetry.states(self._tensor(arrays))
+        allowed = self._tensor(allowed_actions(arrays))
+        least = getattr(self._target, "least", self._target)
+        target_q_next = least(next_states, goals)
+        return double_q_targets(
             self.network(next_states, goals) if config.double_q else target_q_next,
             target_q_next,
             symmetry.action_masks(allowed),
-            self._tensor(goals_reached(batch.next_states, batch.goals)),
-            self._tensor(objects_fallen(batch.next_states)),
+            self._tensor(goals_reached(arrays, batch.goals)),
+            self._tensor(objects_fallen(arrays)),
             config.discount,
         )
-        least = self._tensor(batch.least_returns).float()
-        return torch.maximum(targets, least)
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         """The array where the network is."""

@@ -138,6 +138,7 @@ class Reinforcement:
             # The network goes on learning; physics need the processor, not the GPU.
             deepcopy(self._learner.network).cpu(),
             self.rounds.acting,
+            self._demonstrations[0] if self.rounds.acting.resets else None,
         )
         yield from demonstrate_tasks(
             self._round(index),

@@ -15,7 +15,13 @@ from typing import Final
 import numpy as np
 
 from rhp_drake.learning.dataset import Dataset
-from rhp_drake.task import GOAL_RADIUS, REWARD, object_positions, objects_fallen
+from rhp_drake.task import (
+    GOAL_RADIUS,
+    REWARD,
+    goals_reached,
+    object_positions,
+    objects_fallen,
+)
 
 # Hindsight looks at most this many actions ahead.
 _FORESIGHT: Final = 20
@@ -33,6 +39,8 @@ class Samples:
         next_states: Shape (N, 3 + 3 m).
         goals: Shape (N, m, 2).
         least_returns: What the return is known to reach at least, shape (N,).
+        later_states: Where a simulated way goes on to, shape (N, 3 + 3 m).
+        later_steps: After how many actions, shape (N,).
     """
 
     states: np.ndarray
@@ -40,6 +48,8 @@ class Samples:
     next_states: np.ndarray
     goals: np.ndarray
     least_returns: np.ndarray
+    later_states: np.ndarray
+    later_steps: np.ndarray
 
 
 def sample(
@@ -48,6 +58,7 @@ def sample(
     generator: np.random.Generator,
     *,
     hindsight: float = 0.0,
+    foresight: int = 1,
 ) -> Samples:
     """Draws N transitions and their goals, as many from each source.
 
@@ -59,7 +70,7 @@ def sample(
     """
     shares = np.diff(np.arange(len(sources) + 1) * num_samples // len(sources))
     parts = [
-        _sample(source, int(share), generator, hindsight)
+        _sample(source, int(share), generator, hindsight, foresight)
         for source, share in zip(sources, shares, strict=True)
     ]
     return Samples(
@@ -75,6 +86,7 @@ def _sample(
     num_samples: int,
     generator: np.random.Generator,
     hindsight: float,
+    foresight: int,
 ) -> Samples:
     rows = generator.integers(len(data.search_actions), size=num_samples)
     # The first of them in hindsight.
@@ -91,13 +103,33 @@ def _sample(
     )
     goals[changed][useful] = found[useful]
     least[changed][useful] = REWARD * num_actions[useful]
+    later, later_steps = _go_on(data, rows, goals, foresight)
     return Samples(
         data.search_states[rows],
         data.search_actions[rows],
         data.search_next_states[rows],
         goals,
         least,
+        data.search_next_states[later],
+        later_steps,
     )
+
+
+def _go_on(
+    data: Dataset, rows: np.ndarray, goals: np.ndarray, foresight: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Follows a simulated way on, until the goal or up to so many actions in all."""
+    later = rows.copy()
+    num_actions = np.ones(len(rows), dtype=int)
+    for _ in range(foresight - 1):
+        states = data.search_next_states[later]
+        following = data.followers[later]
+        on = (
+            (following >= 0) & ~goals_reached(states, goals) & ~objects_fallen(states)
+        )
+        later[on] = following[on]
+        num_actions[on] += 1
+    return later, num_actions
 
 
 def _go_back(

@@ -62,4 +62,7 @@ VARIANTS: Final = {
     "epsilon_greedy": replace(BEST, rounds=_acting(horizon=0)),
     "uncertain_physics": replace(BEST, rounds=_acting(uncertainty="high")),
     "paper": PAPER,
+    "n_step": replace(BEST, learning=replace(_LEARNING, bootstrap_steps=3)),
+    "pair": replace(BEST, network="pair"),
+    "resets": replace(BEST, rounds=_acting(resets=0.5)),
 }

@@ -145,6 +145,23 @@ class SetQNetwork(QNetwork):
         return self.head(codes + self.obstacle_encoder(pairs).sum(dim=1))
 
 
+class PairQNetwork(QNetwork):
+    """Two set networks: their mean; `least` their minimum."""
+
+    architecture = "pair"
+    any_number = True
+
+    def __init__(self, num_objects: int) -> None:
+        super().__init__(num_objects)
+        self.members = nn.ModuleList([SetQNetwork(num_objects) for _ in range(2)])
+
+    def forward(self, states: torch.Tensor, goals: torch.Tensor) -> torch.Tensor:
+        return sum(member(states, goals) for member in self.members) / 2
+
+    def least(self, states: torch.Tensor, goals: torch.Tensor) -> torch.Tensor:
+        return torch.minimum(*[member(states, goals) for member in self.members])
+
+
 def _hidden(widths: list[int]) -> list[nn.Module]:
     """Layers of these widths, each with its rectifier."""
     return [
@@ -155,5 +172,5 @@ def _hidden(widths: list[int]) -> list[nn.Module]:
 
 
 ARCHITECTURES: Final[dict[str, type[QNetwork]]] = {
-    network.architecture: network for network in (PaperQNetwork, SetQNetwork)
+    network.architecture: network for network in (PaperQNetwork, SetQNetwork, PairQNetwork)
 }
