@@ -59,6 +59,16 @@ def output_of(simulator: Simulator, system: str, port: str) -> Any:
     return dut.GetOutputPort(port).Eval(context)
 
 
+def goals_of(simulator: Simulator) -> np.ndarray:
+    """Centres of the goal regions, shape (m, 2), m in W; nan without a task."""
+    return output_of(simulator, "goals", "y0").reshape(-1, 2)
+
+
+def _fault_of(simulator: Simulator) -> Fault:
+    """Why the guard has stopped the arm, if it has."""
+    return Fault(int(output_of(simulator, "command_guard", "fault")[0]))
+
+
 def run_closed_loop(
     simulator: Simulator,
     instance: task.TaskInstance,
@@ -136,13 +146,10 @@ def run_on_hardware(
 
     ticks = 0
 
-    def fault() -> Fault:
-        return Fault(int(output_of(simulator, "command_guard", "fault")[0]))
-
     def advance(until: float) -> None:
         nonlocal ticks
         # After a fault at once: who called ends the drivers, which brake.
-        while context.get_time() < until and fault() == Fault.NONE:
+        while context.get_time() < until and _fault_of(simulator) == Fault.NONE:
             begin = time.monotonic()
             # Half-way between two commands, so that each stretch has exactly one: the
             # planner's period is no multiple of theirs.
@@ -180,7 +187,7 @@ def _run(
             num_actions += 1
             on_decision(record)
         planner_status = Status(int(output_of(simulator, "planner", "status")[0]))
-        guard_fault = Fault(int(output_of(simulator, "command_guard", "fault")[0]))
+        guard_fault = _fault_of(simulator)
         if guard_fault != Fault.NONE:
             end = GUARD_FAULT
             message = f"the arm was stopped: {describe(guard_fault)}"
@@ -192,7 +199,7 @@ def _run(
             message = f"not done after {time_limit:g} s in the world."
 
     state = output_of(simulator, "state_estimator", "state")
-    offset = task.object_positions(state)[0] - output_of(simulator, "goals", "y0")[:2]
+    offset = task.object_positions(state)[0] - goals_of(simulator)[0]
     return Outcome(
         status=end,
         message=message,

@@ -19,7 +19,7 @@ from rhp_drake.drivers.measurements import ArmMeasurement, ObjectPose
 from rhp_drake.errors import InputError
 from rhp_drake.hardware import load_hardware
 from rhp_drake.planning.policy import Decision
-from rhp_drake.run_closed_loop import output_of, run_on_hardware
+from rhp_drake.run_closed_loop import goals_of, run_on_hardware
 from rhp_drake.safety import Fault
 from rhp_drake.scenario import Scenario, load_scenario, make_task_instance
 from rhp_drake.station.hardware_station import HardwareConfig, MeasureStation
@@ -145,7 +145,7 @@ def test_the_loop_moves_the_arm_and_takes_its_goals_from_what_it_sees(
     assert outcome.num_actions == 1
     expected = hand_targets(HAND, np.array(Action.FORWARD))
     np.testing.assert_allclose(hand_pose(hardware.arm.position), expected, atol=1e-3)
-    goals = output_of(simulator, "goals", "y0")
+    goals = goals_of(simulator).ravel()
     np.testing.assert_allclose(goals, [0.7, 0.25, *BOXES[1:, :2].ravel()])
     steps = np.diff(hardware.arm.commands, axis=0)
     assert np.abs(steps).max() / COMMAND_PERIOD < 1.0

@@ -22,7 +22,7 @@ from rhp_drake.drivers.ur_driver import UrDriver
 from rhp_drake.errors import InputError, WorkError
 from rhp_drake.hardware import running_hardware
 from rhp_drake.planning.policy_config import MakePolicy
-from rhp_drake.run_closed_loop import Outcome, output_of, run_on_hardware
+from rhp_drake.run_closed_loop import Outcome, goals_of, run_on_hardware
 from rhp_drake.scenario import load_scenario
 from rhp_drake.station.hardware_station import Arm, HardwareConfig, Tracker
 from rhp_drake.systems.receding_horizon_planner import DecisionRecord
@@ -253,7 +253,7 @@ def _serve(
                 outcome = run_on_hardware(
                     simulator, goal, seed=seed, on_decision=decisions.append
                 )
-                goals = output_of(simulator, "goals", "y0").reshape(-1, 2)
+                goals = goals_of(simulator)
                 assert isinstance(running.arm, UrDriver)
                 periods = running.arm.periods.vector
         except KeyboardInterrupt:

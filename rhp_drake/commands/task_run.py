@@ -184,7 +184,7 @@ def run_task(
         on_hardware: Whether the task begins where robot and objects are; of the
             scenario's task the target's goal alone counts.
     """
-    from rhp_drake.run_closed_loop import Outcome, output_of
+    from rhp_drake.run_closed_loop import Outcome, goals_of
 
     decisions: list[DecisionRecord] = []
 
@@ -213,7 +213,7 @@ def run_task(
     goals = None
     # Before, they may not have been set.
     if decisions or outcome.status != INTERRUPTED:
-        goals = output_of(simulator, "goals", "y0").reshape(-1, 2)
+        goals = goals_of(simulator)
     return TaskRun(outcome, decisions, goals, times)
 
 
